@@ -1,0 +1,21 @@
+"""What can go wrong on the sensor side. Each message is one line: what is wrong, what was seen, what to do."""
+
+
+class DriverError(Exception):
+    """Base of all errors of the drivers."""
+
+
+class SourceNotFound(DriverError):
+    """There is no such file, or its metadata is missing."""
+
+
+class BadMetadata(DriverError):
+    """The metadata is not usable, or does not describe the sensor whose packets were seen."""
+
+
+class BadCapture(DriverError):
+    """The recording cannot be read, or holds no frames of the sensor."""
+
+
+class SensorUnavailable(DriverError):
+    """The sensor does not answer, or refuses what is asked of it."""
