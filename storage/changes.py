@@ -1,0 +1,263 @@
+"""changes.db: the objects that appeared and disappeared. Precious, and the contract with other programs.
+
+Synchronous FULL: what was acknowledged outlives a power cut. Tables and views are described in schema.py; other
+programs may read them with any SQLite (open with `mode=ro`), or through ChangeStore.open_reader.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import database
+from .errors import StorageError
+from .schema import CHANGES_MIGRATIONS
+
+POINT_VOXEL_M = 0.05  # a change holds at most one point in each such cube, so that n_points means the same always
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What a detection found. Times are of the sensor's clock in `session`, unless they say host."""
+
+    polarity: str  # appeared | disappeared
+    map_id: int
+    session: int
+    scene: int
+    visit: int  # number of the scene's visit that found it
+    first_seen_ns: int  # the new state was first seen
+    first_seen_host_ns: int  # the same moment, ns since 1970
+    points: np.ndarray | None  # (N, 3) float32, metres, map frame; None where it was read without them
+    confidence: float  # 0..1
+    evidence: Mapping[str, Any]  # what each filter saw; goes to JSON
+    alignment_residual_m: float
+    model_id: str
+    config_digest: str
+    last_before_session: int | None = None  # the old state was last seen
+    last_before_ns: int | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChangeObject(Change):
+    """A change as it is stored."""
+
+    id: int
+    revision: int  # grows with each new or altered change
+    state: str  # present | ended
+    superseded_by: int | None  # the change that ended this one
+    centroid: np.ndarray  # (3,) float64, metres, map frame
+    box_min: np.ndarray  # (3,)
+    box_max: np.ndarray  # (3,)
+    n_points: int
+    detected_host_ns: int
+    updated_host_ns: int
+
+
+class ChangeStore:
+    """The open changes. Thread rule: any thread may call any method; one connection behind one lock."""
+
+    def __init__(self, connection: database.Connection):
+        self._db = connection
+
+    @classmethod
+    def open_writer(cls, path: Path, store_uuid: str) -> ChangeStore:
+        """Open or make. Raises DatabaseFileError, NewerFormat, DataDirError."""
+        return cls(database.open_writer(path, CHANGES_MIGRATIONS, "FULL", store_uuid))
+
+    @classmethod
+    def open_reader(cls, path: Path) -> ChangeStore:
+        """Open read-only, beside the writer. Raises DatabaseFileError, NewerFormat."""
+        return cls(database.open_reader(path, len(CHANGES_MIGRATIONS)))
+
+    def close(self) -> None:
+        self._db.close()
+
+    # Writing ------------------------------------------------------------------------------------------------------
+
+    def add(self, change: Change) -> int:
+        """Store a new change, durably; its id. Raises StorageError where it has no points."""
+        now_ns = time.time_ns()
+        row = {
+            "polarity": change.polarity,
+            "map_id": change.map_id,
+            "session_id": change.session,
+            "scene_id": change.scene,
+            "visit": change.visit,
+            "first_seen_ns": change.first_seen_ns,
+            "first_seen_host_ns": change.first_seen_host_ns,
+            "last_before_session": change.last_before_session,
+            "last_before_ns": change.last_before_ns,
+            **_point_columns(one_per_voxel(change.points)),
+            "confidence": change.confidence,
+            "evidence": json.dumps(dict(change.evidence)),
+            "alignment_residual_m": change.alignment_residual_m,
+            "model_id": change.model_id,
+            "config_digest": change.config_digest,
+            "detected_host_ns": now_ns,
+            "updated_host_ns": now_ns,
+        }
+        with self._db.transaction():
+            change_id = self._db.insert("changes", {**row, "revision": self._next_revision()})
+            where = {"session": change.session, "scene": change.scene, "visit": change.visit}
+            self._observe(change_id, change.polarity, **where, time_ns=change.first_seen_ns)
+        return change_id
+
+    def extend(self, change_id: int, points: np.ndarray, confidence: float, evidence: Mapping[str, Any]) -> None:
+        """Add points (N, 3) of the same object, metres, map frame; those already there stay as they are.
+
+        confidence and evidence replace what was known. Raises StorageError where there is no such change.
+        """
+        with self._db.transaction():
+            old = self.get(change_id)
+            merged = one_per_voxel(np.concatenate([old.points, np.asarray(points, np.float32)]))
+            values = {
+                **_point_columns(merged),
+                "confidence": confidence,
+                "evidence": json.dumps(dict(evidence)),
+            }
+            self._update(change_id, values)
+
+    def observe(
+        self,
+        change_id: int,
+        kind: str,
+        *,
+        session: int,
+        scene: int,
+        visit: int,
+        time_ns: int,
+        superseded_by: int | None = None,
+    ) -> None:
+        """Note that a later visit saw the change: `still` there, or `gone` (undone), by which change if by one."""
+        with self._db.transaction():
+            self.get(change_id, with_points=False)
+            self._observe(change_id, kind, session=session, scene=scene, visit=visit, time_ns=time_ns)
+            ended = {"state": "ended", "superseded_by": superseded_by} if kind == "gone" else {}
+            self._update(change_id, ended)
+
+    # Reading ------------------------------------------------------------------------------------------------------
+
+    def get(self, change_id: int, with_points: bool = True) -> ChangeObject:
+        """One change. Raises StorageError where there is none of this id."""
+        found = self._select("id = ?", [change_id], with_points)
+        if not found:
+            raise StorageError(f"there is no change {change_id}")
+        return found[0]
+
+    def changes(
+        self,
+        *,
+        min_points: int = 0,
+        polarity: str | None = None,
+        map_id: int | None = None,
+        box: tuple[np.ndarray, np.ndarray] | None = None,
+        before: tuple[int, int] | None = None,
+        with_points: bool = True,
+    ) -> list[ChangeObject]:
+        """Changes, in the order of their first sight.
+
+        box: lower and upper corner (3,) metres, map frame; changes whose own box touches it. before: (session,
+        sensor ns); changes first seen earlier, where every moment of an earlier session is earlier.
+        """
+        terms: list[tuple[str, list[Any]]] = [("n_points >= ?", [min_points])]
+        if polarity is not None:
+            terms.append(("polarity = ?", [polarity]))
+        if map_id is not None:
+            terms.append(("map_id = ?", [map_id]))
+        if box is not None:
+            lower, upper = (np.asarray(corner, np.float64).tolist() for corner in box)
+            terms.append(("min_x <= ? AND min_y <= ? AND min_z <= ?", upper))
+            terms.append(("max_x >= ? AND max_y >= ? AND max_z >= ?", lower))
+        if before is not None:
+            terms.append(("(session_id, first_seen_ns) < (?, ?)", list(before)))
+        where = " AND ".join(sql for sql, _ in terms)
+        return self._select(where, [value for _, values in terms for value in values], with_points)
+
+    def publish_change_list(self, n: int) -> list[ChangeObject]:
+        """Metadata of all changes of at least n points, without the points (CDSD section III-D)."""
+        return self.changes(min_points=n, with_points=False)
+
+    def history(self, change_id: int) -> list[dict[str, Any]]:
+        """What the visits saw of a change, oldest first: kind, session_id, scene_id, visit, time_ns."""
+        return self._db.rows(
+            """SELECT kind, session_id, scene_id, visit, time_ns FROM observations
+               WHERE change_id = ? ORDER BY observation_id""",
+            (change_id,),
+        )
+
+    def _select(self, where: str, values: list[Any], with_points: bool) -> list[ChangeObject]:
+        columns = OTHER_COLUMNS + (", points" if with_points else "")
+        rows = self._db.rows(
+            f"SELECT {columns} FROM changes WHERE {where} ORDER BY session_id, first_seen_ns, id", values
+        )
+        return [_change_object(row) for row in rows]
+
+    # Parts of a transaction ---------------------------------------------------------------------------------------
+
+    def _observe(self, change_id: int, kind: str, *, session: int, scene: int, visit: int, time_ns: int) -> None:
+        row = {
+            "change_id": change_id,
+            "kind": kind,
+            "session_id": session,
+            "scene_id": scene,
+            "visit": visit,
+            "time_ns": time_ns,
+        }
+        self._db.insert("observations", row)
+
+    def _update(self, change_id: int, values: Mapping[str, Any]) -> None:
+        values = {**values, "revision": self._next_revision(), "updated_host_ns": time.time_ns()}
+        assignments = ", ".join(f"{name} = ?" for name in values)
+        self._db.write(f"UPDATE changes SET {assignments} WHERE id = ?", (*values.values(), change_id))
+
+    def _next_revision(self) -> int:
+        return self._db.value("SELECT coalesce(max(revision), 0) + 1 FROM changes")
+
+
+# Every column but the points, under the names of ChangeObject's fields.
+OTHER_COLUMNS = """
+    id, revision, polarity, state, superseded_by, map_id, session_id AS session, scene_id AS scene, visit,
+    first_seen_ns, first_seen_host_ns, last_before_session, last_before_ns, x, y, z,
+    min_x, min_y, min_z, max_x, max_y, max_z, n_points, confidence, evidence, alignment_residual_m,
+    model_id, config_digest, detected_host_ns, updated_host_ns"""
+
+
+def one_per_voxel(points: np.ndarray) -> np.ndarray:
+    """The first of the points (N, 3) in each voxel, as float32, in their order."""
+    points = np.asarray(points, np.float32).reshape(-1, 3)
+    voxel = np.floor(points.astype(np.float64) / POINT_VOXEL_M).astype(np.int64)
+    _, first = np.unique(voxel, axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def _point_columns(points: np.ndarray) -> dict[str, Any]:
+    """All columns that follow from the points (N, 3) float32."""
+    if len(points) == 0:
+        raise StorageError("a change without points cannot be stored")
+    centroid = points.mean(axis=0, dtype=np.float64).tolist()
+    lower, upper = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    columns = ("x", "y", "z", "min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
+    return {
+        **dict(zip(columns, centroid + lower + upper, strict=True)),
+        "n_points": len(points),
+        "points": np.ascontiguousarray(points, "<f4").tobytes(),
+    }
+
+
+def _change_object(row: dict[str, Any]) -> ChangeObject:
+    """A row of the table -> a ChangeObject."""
+    row["centroid"] = np.array([row.pop(name) for name in ("x", "y", "z")])
+    row["box_min"] = np.array([row.pop(name) for name in ("min_x", "min_y", "min_z")])
+    row["box_max"] = np.array([row.pop(name) for name in ("max_x", "max_y", "max_z")])
+    blob = row.pop("points", None)
+    row["points"] = None if blob is None else np.frombuffer(blob, "<f4").reshape(-1, 3).astype(np.float32)
+    row["evidence"] = json.loads(row["evidence"])
+    if row["alignment_residual_m"] is None:
+        row["alignment_residual_m"] = np.nan
+    return ChangeObject(**row)

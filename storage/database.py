@@ -1,0 +1,160 @@
+"""SQLite files as this program uses them: WAL, one writer, read-only readers, numbered migrations.
+
+Thread rule: a writer's Connection may be used by any thread; every use takes its lock, so that a transaction of
+one thread is never joined by another's statement. Readers open their own connection in each thread or process.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import sqlite_utils
+
+from .errors import DatabaseFileError, DataDirError, NewerFormat
+
+BUSY_TIMEOUT_S = 5.0  # a reader's checkpoint or backup may hold the file so long
+
+
+class Connection:
+    """One connection, with its lock."""
+
+    def __init__(self, connection: sqlite3.Connection):
+        self._db = sqlite_utils.Database(connection)
+        self._lock = threading.RLock()
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All that is written inside becomes visible and durable at once, or not at all. May be nested."""
+        with self._lock:
+            if self._db.conn.in_transaction:  # the outermost one commits
+                yield
+                return
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            except BaseException:
+                if self._db.conn.in_transaction:
+                    self._db.execute("ROLLBACK")
+                raise
+
+    def write(self, sql: str, values: Sequence[Any] = ()) -> int:
+        """Run one statement; the rowid of what it inserted. Durable at once unless in a transaction."""
+        with self._lock:
+            return self._db.execute(sql, values).lastrowid
+
+    def write_many(self, sql: str, rows: list[Sequence[Any]]) -> None:
+        """Run one statement for each row, in one transaction."""
+        with self.transaction():
+            self._db.conn.executemany(sql, rows)
+
+    def insert(self, table: str, row: dict[str, Any]) -> int:
+        """Insert a row by column names; its rowid."""
+        marks = ", ".join("?" * len(row))
+        return self.write(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
+
+    def rows(self, sql: str, values: Sequence[Any] = ()) -> list[dict[str, Any]]:
+        """All rows of a query, as dictionaries."""
+        with self._lock:
+            return list(self._db.query(sql, values))
+
+    def tuples(self, sql: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """All rows of a query, as tuples: for the large ones."""
+        with self._lock:
+            return self._db.execute(sql, values).fetchall()
+
+    def value(self, sql: str, values: Sequence[Any] = ()) -> Any:
+        """The single value of a query that always has one."""
+        with self._lock:
+            return self._db.execute(sql, values).fetchone()[0]
+
+    def close(self) -> None:
+        """Close the file; the last one to close it folds the WAL into it."""
+        with self._lock:
+            self._db.close()
+
+
+def open_writer(path: Path, migrations: Sequence[str], synchronous: str, store_uuid: str) -> Connection:
+    """Open or make a database and bring it to the newest schema.
+
+    migrations: SQL scripts; the n-th brings `PRAGMA user_version` from n - 1 to n. synchronous: NORMAL (a power cut
+    may lose the last commits, never the file) or FULL (it loses none). store_uuid ties the file to its data
+    directory. Raises DatabaseFileError, NewerFormat, DataDirError.
+    """
+    with _naming(path):
+        connection = sqlite3.connect(path, BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute(f"PRAGMA synchronous = {synchronous}")
+            connection.execute("PRAGMA foreign_keys = ON")
+            connection.execute("PRAGMA journal_size_limit = 67108864")  # bytes of WAL kept after a busy time
+            _migrate(connection, path, migrations)
+            _tie(connection, path, store_uuid)
+        except BaseException:
+            connection.close()
+            raise
+    return Connection(connection)
+
+
+def open_reader(path: Path, n_migrations: int) -> Connection:
+    """Open a database for reading only, beside its writer. Raises DatabaseFileError, NewerFormat."""
+    if not Path(path).exists():
+        raise DatabaseFileError(f"{path}: no such file")
+    with _naming(path):
+        uri = f"file:{quote(str(Path(path).absolute()))}?mode=ro"
+        connection = sqlite3.connect(uri, BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False, uri=True)
+        try:
+            if _refuse_newer(connection, path, n_migrations) < n_migrations:
+                raise DatabaseFileError(f"{path}: not yet brought to this version's schema: start the writer once")
+        except BaseException:
+            connection.close()
+            raise
+    return Connection(connection)
+
+
+def _migrate(connection: sqlite3.Connection, path: Path, migrations: Sequence[str]) -> None:
+    """Each missing migration and its number become visible together: a crash in between leaves neither."""
+    version = _refuse_newer(connection, path, len(migrations))
+    for number, script in enumerate(migrations[version:], start=version + 1):
+        try:
+            connection.executescript(f"BEGIN IMMEDIATE; {script}; PRAGMA user_version = {number}; COMMIT;")
+        except sqlite3.Error:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            raise
+
+
+def _refuse_newer(connection: sqlite3.Connection, path: Path, known: int) -> int:
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    if version > known:
+        raise NewerFormat(f"{path}: schema {version}, by a newer revisitd; this one knows up to {known}: upgrade it")
+    return version
+
+
+def _tie(connection: sqlite3.Connection, path: Path, store_uuid: str) -> None:
+    """A database copied in from elsewhere would claim scans that are not here: notice it."""
+    connection.execute(
+        "INSERT INTO store (only_row, uuid, created_host_ns) VALUES (1, ?, ?) ON CONFLICT DO NOTHING",
+        (store_uuid, time.time_ns()),
+    )
+    found = connection.execute("SELECT uuid FROM store").fetchone()[0]
+    if found != store_uuid:
+        raise DataDirError(
+            f"{path}: belongs to data directory {found}, not to this one ({store_uuid}); put the right file back"
+        )
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of SQLite do not name the file."""
+    try:
+        yield
+    except sqlite3.DatabaseError as error:
+        raise DatabaseFileError(f"{path}: cannot be opened as a database: {error}") from error

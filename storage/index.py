@@ -1,0 +1,346 @@
+"""index.db: sessions, scans, descriptors, scenes, visits and detection instances. Can be rebuilt from the scan files.
+
+Synchronous NORMAL: a killed process loses nothing, a power cut may lose the last commits, whose scan files remain.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from . import database
+from .scans import Scan
+from .schema import INDEX_MIGRATIONS
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """One run of the odometry, without a break."""
+
+    session_id: int
+    map_id: int  # the session whose first scan is the map's origin
+    source: str
+    sensor_digest: str
+    started_host_ns: int
+    config: str  # TOML
+
+
+@dataclass(frozen=True, eq=False)
+class SceneRow:
+    """A place: a convex hull of positions, grown by a margin."""
+
+    scene_id: int
+    map_id: int
+    hull: np.ndarray  # (M, 2) float64 metres, map frame, counter-clockwise
+    margin_m: float
+    area_m2: float  # of the grown hull
+    n_visits: int
+
+
+@dataclass(frozen=True)
+class VisitRow:
+    """One stay in a scene."""
+
+    visit_id: int
+    scene_id: int
+    number: int  # 1 is the visit that made the scene
+    session: int
+    t_in_ns: int
+    t_out_ns: int | None  # None: the robot is still there
+
+
+@dataclass(frozen=True)
+class InstanceRow:
+    """One run of change detection, as it is recorded."""
+
+    scene_id: int
+    visit_id: int
+    status: str  # done | rejected | dropped | failed
+    reason: str = ""  # why it is not done
+    seconds: float = 0.0
+    stage_seconds: Mapping[str, float] | None = None
+    n_cumulative_scans: int = 0
+    n_recent_scans: int = 0
+    n_candidates: int = 0  # points
+    n_confirmed: int = 0  # points
+    n_changes: int = 0  # objects
+    alignment_residual_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """N key scans in the order of their ids, which is that of time."""
+
+    scan_id: np.ndarray  # (N,) int64
+    session: np.ndarray  # (N,) int64
+    stamp_ns: np.ndarray  # (N,) int64, sensor clock of the session
+    T_map_sensor: np.ndarray  # (N, 4, 4) float64, at each scan's end
+    aligned: np.ndarray  # (N,) bool
+
+
+@dataclass(frozen=True, eq=False)
+class SceneScans(Trajectory):
+    """N key scans of one scene, each once."""
+
+    visit_number: np.ndarray  # (N,) int64
+    descriptors: np.ndarray  # (N, D) float32, unit
+    model_id: np.ndarray  # (N,) str, of the descriptors
+
+
+POSE = "s.scan_id, s.session_id, s.stamp_ns, s.aligned, s.x, s.y, s.z, s.qx, s.qy, s.qz, s.qw"
+
+
+class IndexStore:
+    """The open index. Thread rule: any thread may call any method; one connection behind one lock."""
+
+    def __init__(self, connection: database.Connection):
+        self._db = connection
+
+    @classmethod
+    def open_writer(cls, path: Path, store_uuid: str) -> IndexStore:
+        """Open or make. Raises DatabaseFileError, NewerFormat, DataDirError."""
+        return cls(database.open_writer(path, INDEX_MIGRATIONS, "NORMAL", store_uuid))
+
+    @classmethod
+    def open_reader(cls, path: Path) -> IndexStore:
+        """Open read-only, beside the writer. Raises DatabaseFileError, NewerFormat."""
+        return cls(database.open_reader(path, len(INDEX_MIGRATIONS)))
+
+    def close(self) -> None:
+        self._db.close()
+
+    def transaction(self) -> AbstractContextManager[None]:
+        """What is written inside is there whole or not at all: a key scan with its visits, for instance."""
+        return self._db.transaction()
+
+    # Sessions -----------------------------------------------------------------------------------------------------
+
+    def start_session(
+        self,
+        *,
+        source: str,
+        sensor_digest: str,
+        serial: str,
+        product: str,
+        firmware: str,
+        profile: str,
+        clock_source: str,
+        config: str,
+        software_version: str,
+        map_id: int | None = None,
+    ) -> int:
+        """Note a new session and return its id. map_id None: it makes a new map, whose id is the session's.
+
+        Closes what a killed process left open.
+        """
+        with self._db.transaction():
+            self._close_open_visits()
+            row = {
+                "map_id": map_id or 0,
+                "source": source,
+                "started_host_ns": time.time_ns(),
+                "sensor_digest": sensor_digest,
+                "serial": serial,
+                "product": product,
+                "firmware": firmware,
+                "profile": profile,
+                "clock_source": clock_source,
+                "config": config,
+                "software_version": software_version,
+            }
+            session_id = self._db.insert("sessions", row)
+            if map_id is None:
+                self._db.write("UPDATE sessions SET map_id = session_id WHERE session_id = ?", (session_id,))
+            return session_id
+
+    def end_session(self, session_id: int) -> None:
+        """Note the end of a session, and of the visits still open."""
+        with self._db.transaction():
+            self._close_open_visits()
+            self._db.write(
+                "UPDATE sessions SET ended_host_ns = ? WHERE session_id = ?", (time.time_ns(), session_id)
+            )
+
+    def sessions(self) -> list[SessionRow]:
+        """All sessions, oldest first."""
+        columns = "session_id, map_id, source, sensor_digest, started_host_ns, config"
+        return [SessionRow(**row) for row in self._db.rows(f"SELECT {columns} FROM sessions ORDER BY session_id")]
+
+    def _close_open_visits(self) -> None:
+        """A visit ends with its last scan where nobody noted its end."""
+        self._db.write(
+            """UPDATE visits SET t_out_ns = coalesce(
+                   (SELECT max(s.stamp_ns) FROM visit_scans AS vs JOIN scans AS s USING (scan_id)
+                    WHERE vs.visit_id = visits.visit_id), t_in_ns)
+               WHERE t_out_ns IS NULL"""
+        )
+
+    # Scans --------------------------------------------------------------------------------------------------------
+
+    def next_scan_id(self) -> int:
+        """The lowest scan id that was never used by this index."""
+        return self._next_id("scans")
+
+    def add_scan(self, scan: Scan, n_bytes: int) -> None:
+        """Note a key scan whose file of n_bytes is written."""
+        quaternion = Rotation.from_matrix(scan.T_map_sensor[:3, :3]).as_quat()
+        row = {
+            "scan_id": scan.scan_id,
+            "session_id": scan.session,
+            "stamp_ns": scan.stamp_ns,
+            "host_ns": scan.host_ns,
+            **dict(zip("xyz", scan.T_map_sensor[:3, 3].tolist(), strict=True)),
+            **dict(zip(("qx", "qy", "qz", "qw"), quaternion.tolist(), strict=True)),
+            "aligned": int(scan.aligned),
+            "residual_m": scan.alignment_residual_m,  # NaN becomes NULL
+            "bytes": n_bytes,
+        }
+        descriptor = {
+            "scan_id": scan.scan_id,
+            "model_id": scan.model_id,
+            "descriptor": np.asarray(scan.descriptor, "<f4").tobytes(),
+        }
+        with self._db.transaction():
+            self._db.insert("scans", row)
+            self._db.insert("descriptors", descriptor)
+
+    def trajectory(self, session: int | None = None) -> Trajectory:
+        """Poses of all key scans, or of one session's."""
+        where, values = ("WHERE s.session_id = ?", (session,)) if session is not None else ("", ())
+        rows = self._db.tuples(f"SELECT {POSE} FROM scans AS s {where} ORDER BY s.scan_id", values)
+        return Trajectory(**_trajectory_columns(rows))
+
+    def all_descriptors(self, model_id: str) -> tuple[np.ndarray, np.ndarray]:
+        """Scan ids (N,) int64, ascending, and descriptors (N, D) float32 of all scans described by this model."""
+        rows = self._db.tuples(
+            "SELECT scan_id, descriptor FROM descriptors WHERE model_id = ? ORDER BY scan_id", (model_id,)
+        )
+        return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
+
+    # Scenes and visits --------------------------------------------------------------------------------------------
+
+    def next_scene_id(self) -> int:
+        """The lowest scene id that was never used."""
+        return self._next_id("scenes")
+
+    def add_scene(self, scene_id: int, map_id: int, hull: np.ndarray, margin_m: float, area_m2: float) -> None:
+        """Note a scene. hull (M, 2) metres, map frame."""
+        row = {
+            "scene_id": scene_id,
+            "map_id": map_id,
+            "hull": json.dumps(np.asarray(hull, np.float64).tolist()),
+            "margin_m": margin_m,
+            "area_m2": area_m2,
+            "created_host_ns": time.time_ns(),
+        }
+        self._db.insert("scenes", row)
+
+    def scenes(self, map_id: int | None = None) -> list[SceneRow]:
+        """All scenes of a map, or of all maps, by id."""
+        where, values = ("WHERE map_id = ?", (map_id,)) if map_id is not None else ("", ())
+        rows = self._db.rows(
+            f"""SELECT scene_id, map_id, hull, margin_m, area_m2,
+                       (SELECT coalesce(max(number), 0) FROM visits WHERE scene_id = scenes.scene_id) AS n_visits
+                FROM scenes {where} ORDER BY scene_id""",
+            values,
+        )
+        return [SceneRow(**{**row, "hull": np.array(json.loads(row["hull"])).reshape(-1, 2)}) for row in rows]
+
+    def open_visit(self, scene_id: int, number: int, session: int, t_in_ns: int) -> int:
+        """Note that a visit began; its id."""
+        row = {"scene_id": scene_id, "number": number, "session_id": session, "t_in_ns": t_in_ns}
+        return self._db.insert("visits", row)
+
+    def add_visit_scans(self, visit_id: int, scan_ids: Iterable[int]) -> None:
+        """Note scans as part of a visit."""
+        rows = [(visit_id, scan_id) for scan_id in scan_ids]
+        self._db.write_many("INSERT INTO visit_scans (visit_id, scan_id) VALUES (?, ?)", rows)
+
+    def close_visit(self, visit_id: int, t_out_ns: int) -> None:
+        """Note that a visit ended."""
+        self._db.write("UPDATE visits SET t_out_ns = ? WHERE visit_id = ?", (t_out_ns, visit_id))
+
+    def visits(self, scene_id: int) -> list[VisitRow]:
+        """All visits to a scene, by number."""
+        rows = self._db.rows(
+            """SELECT visit_id, scene_id, number, session_id AS session, t_in_ns, t_out_ns
+               FROM visits WHERE scene_id = ? ORDER BY number""",
+            (scene_id,),
+        )
+        return [VisitRow(**row) for row in rows]
+
+    def scans_of_scene(
+        self, scene_id: int, *, visit: int | None = None, before_visit: int | None = None
+    ) -> SceneScans:
+        """Key scans of a scene: of all visits, of visit number `visit`, or of those numbered below `before_visit`."""
+        where, values = "", (scene_id,)
+        if visit is not None:
+            where, values = "AND v.number = ?", (scene_id, visit)
+        elif before_visit is not None:
+            where, values = "AND v.number < ?", (scene_id, before_visit)
+        rows = self._db.tuples(
+            f"""SELECT {POSE}, v.number, d.model_id, d.descriptor
+                FROM visits AS v JOIN visit_scans USING (visit_id) JOIN scans AS s USING (scan_id)
+                     JOIN descriptors AS d USING (scan_id)
+                WHERE v.scene_id = ? {where} ORDER BY s.scan_id""",
+            values,
+        )
+        return SceneScans(
+            **_trajectory_columns(rows),
+            visit_number=np.array([row[11] for row in rows], np.int64),
+            model_id=np.array([row[12] for row in rows], np.str_),
+            descriptors=_descriptors([row[13] for row in rows]),
+        )
+
+    # Instances ----------------------------------------------------------------------------------------------------
+
+    def record_instance(self, instance: InstanceRow) -> int:
+        """Note how one run of change detection went; its id."""
+        row = {
+            **vars(instance),
+            "stage_seconds": json.dumps(dict(instance.stage_seconds or {})),
+            "finished_host_ns": time.time_ns(),
+        }
+        return self._db.insert("instances", row)
+
+    def counts(self) -> dict[str, int]:
+        """Rows of each kind, the bytes of all scan files, and the instances by status."""
+        tables = ("sessions", "scans", "scenes", "visits")
+        counts = {table: self._db.value(f"SELECT count(*) FROM {table}") for table in tables}
+        counts["scan_bytes"] = self._db.value("SELECT coalesce(sum(bytes), 0) FROM scans")
+        for status in ("done", "rejected", "dropped", "failed"):
+            counts[f"instances_{status}"] = self._db.value(
+                "SELECT count(*) FROM instances WHERE status = ?", (status,)
+            )
+        return counts
+
+    def _next_id(self, table: str) -> int:
+        return self._db.value("SELECT coalesce(max(seq), 0) + 1 FROM sqlite_sequence WHERE name = ?", (table,))
+
+
+def _trajectory_columns(rows: list[tuple]) -> dict[str, np.ndarray]:
+    """Rows that begin with POSE -> the columns of a Trajectory."""
+    poses = np.array([row[4:11] for row in rows], np.float64).reshape(-1, 7)
+    T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rows:
+        T_map_sensor[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
+        T_map_sensor[:, :3, 3] = poses[:, :3]
+    return {
+        "scan_id": np.array([row[0] for row in rows], np.int64),
+        "session": np.array([row[1] for row in rows], np.int64),
+        "stamp_ns": np.array([row[2] for row in rows], np.int64),
+        "aligned": np.array([row[3] for row in rows], bool),
+        "T_map_sensor": T_map_sensor,
+    }
+
+
+def _descriptors(blobs: list[bytes]) -> np.ndarray:
+    """Equal-length blobs of float32 -> (N, D) float32."""
+    return np.frombuffer(b"".join(blobs), "<f4").reshape(len(blobs), -1 if blobs else 0).astype(np.float32)

@@ -1,0 +1,75 @@
+"""The whole data directory, opened at once: scans, index and changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+
+from .changes import ChangeStore
+from .datadir import DataDir
+from .index import IndexStore
+from .scans import Scan, ScanStore
+
+
+class Store:
+    """An open data directory. A context manager; `close` may be called twice."""
+
+    def __init__(self, data_dir: DataDir, scans: ScanStore, index: IndexStore, changes: ChangeStore):
+        self.dir, self.scans, self.index, self.changes = data_dir, scans, index, changes
+
+    @classmethod
+    def open_writer(cls, path: Path) -> Store:
+        """Open for writing, made if it is not there.
+
+        Raises DataDirBusy, DataDirError, NewerFormat, DatabaseFileError, OSError (no permission, disk full).
+        """
+        with ExitStack() as opened:
+            data_dir = DataDir.open_writer(path)
+            opened.callback(data_dir.close)
+            scans = ScanStore(data_dir.scans_path)
+            scans.prepare()
+            index = IndexStore.open_writer(data_dir.index_path, data_dir.uuid)
+            opened.callback(index.close)
+            changes = ChangeStore.open_writer(data_dir.changes_path, data_dir.uuid)
+            opened.pop_all()
+        store = cls(data_dir, scans, index, changes)
+        store._next_scan_id = max(index.next_scan_id(), scans.highest_id() + 1)
+        return store
+
+    @classmethod
+    def open_reader(cls, path: Path) -> Store:
+        """Open for reading, beside a writer or without one. Raises DataDirError, NewerFormat, DatabaseFileError."""
+        data_dir = DataDir.open_reader(path)
+        with ExitStack() as opened:
+            index = IndexStore.open_reader(data_dir.index_path)
+            opened.callback(index.close)
+            changes = ChangeStore.open_reader(data_dir.changes_path)
+            opened.pop_all()
+        return cls(data_dir, ScanStore(data_dir.scans_path), index, changes)
+
+    def new_scan_id(self) -> int:
+        """An id that no scan has had before, higher than all."""
+        scan_id = self._next_scan_id
+        self._next_scan_id += 1
+        return scan_id
+
+    def add_scan(self, scan: Scan, visit_ids: Iterable[int] = ()) -> None:
+        """Store a key scan: first its file, then its row with its place in the visits. A crash in between
+        leaves a file that the index does not know; nothing is ever in the index without its file."""
+        n_bytes = self.scans.write(scan)
+        with self.index.transaction():
+            self.index.add_scan(scan, n_bytes)
+            for visit_id in visit_ids:
+                self.index.add_visit_scans(visit_id, [scan.scan_id])
+
+    def close(self) -> None:
+        self.changes.close()
+        self.index.close()
+        self.dir.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
