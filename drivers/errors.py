@@ -1,4 +1,4 @@
-"""What can go wrong on the sensor side. Each message is one line: what is wrong, what was seen, what to do."""
+"""What can go wrong on the sensor side. Messages are one line: what is wrong, what was seen, what to do."""
 
 
 class DriverError(Exception):

@@ -8,7 +8,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Everything the program needs of one sensor's metadata. H beams, W columns (measurement ids) per rotation."""
+    """Everything the program needs of one sensor's metadata: H beams, W columns (measurement ids) a turn."""
 
     serial: str
     product: str
