@@ -7,92 +7,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import database
+from .rows import InstanceRow, SceneRow, SceneScans, SessionRow, Trajectory, VisitRow
 from .scans import Scan
 from .schema import INDEX_MIGRATIONS
-
-
-@dataclass(frozen=True)
-class SessionRow:
-    """One run of the odometry, without a break."""
-
-    session_id: int
-    map_id: int  # the session whose first scan is the map's origin
-    source: str
-    sensor_digest: str
-    started_host_ns: int
-    config: str  # TOML
-
-
-@dataclass(frozen=True, eq=False)
-class SceneRow:
-    """A place: a convex hull of positions, grown by a margin."""
-
-    scene_id: int
-    map_id: int
-    hull: np.ndarray  # (M, 2) float64 metres, map frame, counter-clockwise
-    margin_m: float
-    area_m2: float  # of the grown hull
-    n_visits: int
-
-
-@dataclass(frozen=True)
-class VisitRow:
-    """One stay in a scene."""
-
-    visit_id: int
-    scene_id: int
-    number: int  # 1 is the visit that made the scene
-    session: int
-    t_in_ns: int
-    t_out_ns: int | None  # None: the robot is still there
-
-
-@dataclass(frozen=True)
-class InstanceRow:
-    """One run of change detection, as it is recorded."""
-
-    scene_id: int
-    visit_id: int
-    status: str  # done | rejected | dropped | failed
-    reason: str = ""  # why it is not done
-    seconds: float = 0.0
-    stage_seconds: Mapping[str, float] | None = None
-    n_cumulative_scans: int = 0
-    n_recent_scans: int = 0
-    n_candidates: int = 0  # points
-    n_confirmed: int = 0  # points
-    n_changes: int = 0  # objects
-    alignment_residual_m: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """N key scans in the order of their ids, which is that of time."""
-
-    scan_id: np.ndarray  # (N,) int64
-    session: np.ndarray  # (N,) int64
-    stamp_ns: np.ndarray  # (N,) int64, sensor clock of the session
-    T_map_sensor: np.ndarray  # (N, 4, 4) float64, at each scan's end
-    aligned: np.ndarray  # (N,) bool
-
-
-@dataclass(frozen=True, eq=False)
-class SceneScans(Trajectory):
-    """N key scans of one scene, each once."""
-
-    visit_number: np.ndarray  # (N,) int64
-    descriptors: np.ndarray  # (N, D) float32, unit
-    model_id: np.ndarray  # (N,) str, of the descriptors
-
 
 POSE = "s.scan_id, s.session_id, s.stamp_ns, s.aligned, s.x, s.y, s.z, s.qx, s.qy, s.qz, s.qw"
 
@@ -164,9 +89,7 @@ class IndexStore:
         """Note the end of a session, and of the visits still open."""
         with self._db.transaction():
             self._close_open_visits()
-            self._db.write(
-                "UPDATE sessions SET ended_host_ns = ? WHERE session_id = ?", (time.time_ns(), session_id)
-            )
+            self._db.write("UPDATE sessions SET ended_host_ns = ? WHERE session_id = ?", (time.time_ns(), session_id))
 
     def sessions(self) -> list[SessionRow]:
         """All sessions, oldest first."""
@@ -276,9 +199,7 @@ class IndexStore:
         )
         return [VisitRow(**row) for row in rows]
 
-    def scans_of_scene(
-        self, scene_id: int, *, visit: int | None = None, before_visit: int | None = None
-    ) -> SceneScans:
+    def scans_of_scene(self, scene_id: int, *, visit: int | None = None, before_visit: int | None = None) -> SceneScans:
         """Key scans of a scene: of all visits, of visit number `visit`, or of those numbered below `before_visit`."""
         where, values = "", (scene_id,)
         if visit is not None:
@@ -316,9 +237,7 @@ class IndexStore:
         counts = {table: self._db.value(f"SELECT count(*) FROM {table}") for table in tables}
         counts["scan_bytes"] = self._db.value("SELECT coalesce(sum(bytes), 0) FROM scans")
         for status in ("done", "rejected", "dropped", "failed"):
-            counts[f"instances_{status}"] = self._db.value(
-                "SELECT count(*) FROM instances WHERE status = ?", (status,)
-            )
+            counts[f"instances_{status}"] = self._db.value("SELECT count(*) FROM instances WHERE status = ?", (status,))
         return counts
 
     def _next_id(self, table: str) -> int:

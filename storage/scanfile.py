@@ -51,9 +51,7 @@ def encode(scan: Scan) -> bytes:
         "descriptor": np.asarray(scan.descriptor, "<f4").tobytes(),
     }
     header = {
-        field.name: getattr(scan, field.name)
-        for field in dataclasses.fields(scan)
-        if field.name not in ARRAYS + POSES
+        field.name: getattr(scan, field.name) for field in dataclasses.fields(scan) if field.name not in ARRAYS + POSES
     }
     if math.isnan(scan.alignment_residual_m):
         header["alignment_residual_m"] = None  # JSON has no NaN

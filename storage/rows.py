@@ -1,0 +1,86 @@
+"""What the index holds, as the rest of the program sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """One run of the odometry, without a break."""
+
+    session_id: int
+    map_id: int  # the session whose first scan is the map's origin
+    source: str
+    sensor_digest: str
+    started_host_ns: int
+    config: str  # TOML
+
+
+@dataclass(frozen=True, eq=False)
+class SceneRow:
+    """A place: a convex hull of positions, grown by a margin."""
+
+    scene_id: int
+    map_id: int
+    hull: np.ndarray  # (M, 2) float64 metres, map frame, counter-clockwise
+    margin_m: float
+    area_m2: float  # of the grown hull
+    n_visits: int
+
+
+@dataclass(frozen=True)
+class VisitRow:
+    """One stay in a scene."""
+
+    visit_id: int
+    scene_id: int
+    number: int  # 1 is the visit that made the scene
+    session: int
+    t_in_ns: int
+    t_out_ns: int | None  # None: the robot is still there
+
+
+@dataclass(frozen=True)
+class InstanceRow:
+    """One run of change detection, as it is recorded."""
+
+    scene_id: int
+    visit_id: int
+    status: str  # done | rejected | dropped | failed
+    reason: str = ""  # why it is not done
+    seconds: float = 0.0
+    stage_seconds: Mapping[str, float] | None = None
+    n_cumulative_scans: int = 0
+    n_recent_scans: int = 0
+    n_candidates: int = 0  # points
+    n_confirmed: int = 0  # points
+    n_changes: int = 0  # objects
+    alignment_residual_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """N key scans in the order of their ids, which is that of time."""
+
+    scan_id: np.ndarray  # (N,) int64
+    session: np.ndarray  # (N,) int64
+    stamp_ns: np.ndarray  # (N,) int64, sensor clock of the session
+    T_map_sensor: np.ndarray  # (N, 4, 4) float64, at each scan's end
+    aligned: np.ndarray  # (N,) bool
+
+
+@dataclass(frozen=True, eq=False)
+class SceneScans(Trajectory):
+    """N key scans of one scene, each once."""
+
+    visit_number: np.ndarray  # (N,) int64
+    descriptors: np.ndarray  # (N, D) float32, unit
+    model_id: np.ndarray  # (N,) str, of the descriptors
+
+    def only(self, keep: np.ndarray) -> SceneScans:
+        """Some of the scans; keep (N,) bool."""
+        return SceneScans(**{name: column[keep] for name, column in vars(self).items()})
