@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from typing import Self
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,10 @@ class Trajectory:
     stamp_ns: np.ndarray  # (N,) int64, sensor clock of the session
     T_map_sensor: np.ndarray  # (N, 4, 4) float64, at each scan's end
     aligned: np.ndarray  # (N,) bool
+
+    def only(self, rows: np.ndarray) -> Self:
+        """The scans of these rows: (N,) bool, or indices."""
+        return type(self)(**{name: column[rows] for name, column in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,6 +95,16 @@ def test_the_scans_of_earlier_visits_and_of_one_visit_are_told_apart(index, sess
     np.testing.assert_array_equal(scans.descriptors, [make_scan(i).descriptor for i in scans.scan_id])
 
 
+def test_rows_may_be_chosen_from_the_scans_of_a_scene(index, session):
+    index.add_scene(1, session, np.array([[0.0, 0.0]]), 2.5, 20.0)
+    add_visit(index, 1, 1, session, [1, 2, 3])
+    scans = index.scans_of_scene(1)
+    chosen = scans.only(scans.scan_id != 2)
+    assert chosen.scan_id.tolist() == [1, 3]
+    np.testing.assert_array_equal(chosen.descriptors, scans.descriptors[[0, 2]])
+    assert scans.only(np.array([2, 0])).scan_id.tolist() == [3, 1]
+
+
 def test_a_scan_may_belong_to_visits_of_several_scenes(index, session):
     for scene in (1, 2):
         index.add_scene(scene, session, np.array([[0.0, 0.0]]), 2.5, 20.0)
