@@ -1,0 +1,1 @@
+"""Change detection between two submaps (CDSD section III-C): pure functions on arrays."""

@@ -1,0 +1,139 @@
+"""The change manager (CDSD section III-D): detected objects become change objects, each physical change one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..storage.changes import Change, ChangeObject, ChangeStore
+from .detection.detector import DetectedObject
+
+ERASE_M = 0.3  # a removed object's points are erased from older scans within tau of what was seen of it
+TOUCH_M = 0.4  # objects nearer than the cluster distance are one
+MIN_TOUCH_SHARE = 0.15  # ... if so much of the smaller one touches: neighbours that graze each other stay two
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Where and by what a change was found."""
+
+    map_id: int
+    session: int
+    scene: int
+    visit: int
+    after_host_ns: int
+    before_session: int
+    alignment_residual_m: float
+    model_id: str
+    config_digest: str
+
+
+class ChangeManager:
+    """Adds what a detection found to the store, and answers planners."""
+
+    def __init__(self, store: ChangeStore):
+        self._store = store
+
+    def record(self, found: DetectedObject, finding: Finding) -> bool:
+        """Store a detected object; False when the store has this change already (it is completed, not doubled).
+
+        The same change seen from a neighbouring scene or on a later visit touches one of its polarity that still
+        holds. One that it undoes (what appeared has gone again) is marked as ended by it.
+        """
+        touching = self._touching(found.points, finding.map_id)
+        confidence, evidence = _confidence(found), _evidence(found)
+        same = [change for change in touching if change.polarity == found.polarity]
+        if same:
+            known = max(same, key=lambda change: change.n_points)
+            if known.session == finding.session and found.before_ns < known.first_seen_ns:
+                # The same interval: another view of the same moment completes the object.
+                self._store.extend(known.id, found.points, max(confidence, known.confidence), evidence)
+            self._observe(known, "still", found, finding)
+            return False
+        change_id = self._store.add(_change(found, finding, confidence, evidence))
+        for undone in touching:
+            self._observe(undone, "gone", found, finding, superseded_by=change_id)
+        return True
+
+    def publish_change_list(self, n: int) -> list[ChangeObject]:
+        """Metadata of all changes of at least n points."""
+        return self._store.publish_change_list(n)
+
+    def update_map(
+        self, points: np.ndarray, taken: np.ndarray, map_id: int, until: tuple[int, int]
+    ) -> np.ndarray:
+        """Which points (N, 3) float32 of older scans still stand, by all that was known to be gone at a time.
+
+        taken (N, 2) int64: session and sensor time of each point's scan; until: session and sensor time. What a
+        removed object left in scans taken before it was gone is erased; scans taken after it came back stay.
+        """
+        stands = np.ones(len(points), dtype=bool)
+        if len(points) == 0:
+            return stands
+        box = points.min(axis=0) - ERASE_M, points.max(axis=0) + ERASE_M
+        for gone in self._store.changes(polarity="disappeared", map_id=map_id, box=box, before=until):
+            near = np.flatnonzero(
+                ((points > gone.box_min - ERASE_M) & (points < gone.box_max + ERASE_M)).all(axis=1)
+                & _before(taken, (gone.session, gone.first_seen_ns))
+            )
+            distance, _ = cKDTree(gone.points).query(points[near], distance_upper_bound=ERASE_M)
+            stands[near[np.isfinite(distance)]] = False
+        return stands
+
+    def _touching(self, points: np.ndarray, map_id: int) -> list[ChangeObject]:
+        """Changes that hold (nothing undid them) and share their place with the points."""
+        box = points.min(axis=0) - TOUCH_M, points.max(axis=0) + TOUCH_M
+        near = self._store.changes(map_id=map_id, box=box)
+        return [c for c in near if c.state == "present" and _touch_share(c.points, points) >= MIN_TOUCH_SHARE]
+
+    def _observe(self, change: ChangeObject, kind: str, found: DetectedObject, finding: Finding, **more: int) -> None:
+        where = {"session": finding.session, "scene": finding.scene, "visit": finding.visit}
+        self._store.observe(change.id, kind, **where, time_ns=found.after_ns, **more)
+
+
+def _touch_share(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of the smaller point set that lies within TOUCH_M of the other."""
+    small, large = (a, b) if len(a) <= len(b) else (b, a)
+    distance, _ = cKDTree(large).query(small, distance_upper_bound=TOUCH_M)
+    return float(np.isfinite(distance).mean())
+
+
+def _before(taken: np.ndarray, moment: tuple[int, int]) -> np.ndarray:
+    session, ns = moment
+    return (taken[:, 0] < session) | ((taken[:, 0] == session) & (taken[:, 1] < ns))
+
+
+def _confidence(found: DetectedObject) -> float:
+    """An ordering from 0 to 1, not yet a probability: more scans that agree, and more of the object confirmed."""
+    agreeing = min(found.n_confirming, found.n_seen_by)
+    return (1.0 - 0.5**agreeing) * (found.n_confirmed / len(found.points)) ** 0.25
+
+
+def _evidence(found: DetectedObject) -> dict[str, int]:
+    return {
+        "points_confirmed": found.n_confirmed,
+        "scans_showing_it": found.n_seen_by,
+        "scans_looking_through": found.n_confirming,
+    }
+
+
+def _change(found: DetectedObject, finding: Finding, confidence: float, evidence: dict[str, int]) -> Change:
+    return Change(
+        polarity=found.polarity,
+        map_id=finding.map_id,
+        session=finding.session,
+        scene=finding.scene,
+        visit=finding.visit,
+        first_seen_ns=found.after_ns,
+        first_seen_host_ns=finding.after_host_ns,
+        points=found.points,
+        confidence=confidence,
+        evidence=evidence,
+        alignment_residual_m=finding.alignment_residual_m,
+        model_id=finding.model_id,
+        config_digest=finding.config_digest,
+        last_before_session=finding.before_session,
+        last_before_ns=found.before_ns,
+    )

@@ -1,0 +1,174 @@
+"""Ground by polar bins with Gaussian planes (CDSD III-C, after Patchwork++), and the ground filter B1/B2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+BIN_M = 2.5  # ring width and arc length of a bin: kerbs and slopes stay within a plane's spread
+MAX_RADIUS_M = 60.0
+CELL_M = 0.25  # planes are fitted to one low point for each cell: a bag's many returns weigh no more than its place
+CELL_DEPTH_M = 0.08  # a cell's low point is the mean of its returns so far above the lowest
+SEED_HEIGHT_M = 0.4  # above a bin's lowest points; a 15 % slope rises so much over a bin
+FIT_DISTANCE_M = 0.12
+MIN_BIN_CELLS = 10  # of the hundred in a bin
+MIN_UPRIGHT = 0.85  # cosine of 32 degrees
+MAX_STEP_M = 0.35  # a bin's plane so far above what its neighbours say is a roof or a hedge, not ground
+MAX_BORROW_M = 6.0  # a bin without a plane of its own uses the nearest one within this
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Planes of the bins that have ground: mean (B, 3), normal (B, 3) upward, covariance (B, 3, 3), sigma (B,) metres."""
+
+    mean: np.ndarray
+    normal: np.ndarray
+    covariance: np.ndarray
+    sigma: np.ndarray
+    _tree: cKDTree | None
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Index of the bin whose mean is nearest in the plane (N,), and whether it is near enough to speak (N,)."""
+        if self._tree is None:
+            return np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=bool)
+        distance, index = self._tree.query(points[:, :2])
+        return index, distance <= MAX_BORROW_M
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (N,) metres of points above the nearest plane; NaN where no ground is known."""
+        index, known = self.nearest(points)
+        out = np.full(len(points), np.nan, dtype=np.float32)
+        at = index[known]
+        out[known] = ((points[known] - self.mean[at]) * self.normal[at]).sum(axis=1)
+        return out
+
+
+def segment_ground(
+    points: np.ndarray, centre: np.ndarray, sigmas: float, min_sigma_m: float
+) -> tuple[np.ndarray, Ground]:
+    """Which points (N, 3) float32 (map frame, z roughly up) are ground, and the planes that say so.
+
+    A point is ground if its Mahalanobis distance along the plane's normal is below `sigmas`; whatever lies under
+    the plane is ground too (reflections in water). centre (2,): where the polar bins are centred.
+    Returns labels (N,) bool and the Ground.
+    """
+    bins, n_bins = _polar_bins(points, centre)
+    low = _low_points(points)
+    ground = _consistent(_fit_planes(low, _polar_bins(low, centre)[0], n_bins))
+    if not len(ground.mean):
+        return np.zeros(len(points), dtype=bool), ground
+    # One plane for each bin, looked up by bin: a tree query for each of a million points would cost a second.
+    centres = _bin_centres(points, bins, n_bins)
+    plane_of_bin, known = ground.nearest(centres)
+    normal = ground.normal[plane_of_bin].astype(np.float32)
+    mean = ground.mean[plane_of_bin]
+    limit = np.where(known, sigmas * np.maximum(ground.sigma[plane_of_bin], min_sigma_m), -np.inf).astype(np.float32)
+    level = (normal * mean).sum(axis=1).astype(np.float32)
+    height = np.einsum("ij,ij->i", points, normal[bins]) - level[bins]
+    return height < limit[bins], ground
+
+
+def is_ground_like(points: np.ndarray, ground: Ground, c1_m: float, c2: float) -> bool:
+    """Ground filter: does an object's Gaussian lie in and look like the nearest ground (B1 < c1 and B2 < c2)?"""
+    mean = points.mean(axis=0, dtype=np.float64)
+    index, known = ground.nearest(mean[None])
+    if not known[0]:
+        return False
+    sigma_g = ground.covariance[index[0]] + 1e-6 * np.eye(3)
+    sigma_o = np.cov(points.T.astype(np.float64)) + 1e-6 * np.eye(3)
+    b1 = abs((mean - ground.mean[index[0]]) @ ground.normal[index[0]])
+    log_det = [np.linalg.slogdet(m)[1] for m in (0.5 * (sigma_g + sigma_o), sigma_g, sigma_o)]
+    b2 = 0.5 * (log_det[0] - 0.5 * (log_det[1] + log_det[2]))
+    return bool(b1 < c1_m and b2 < c2)
+
+
+def _polar_bins(points: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, int]:
+    """Bin (N,) of each point on rings of equal width whose sectors have about equal arcs; and the number of bins."""
+    dx, dy = points[:, 0] - np.float32(centre[0]), points[:, 1] - np.float32(centre[1])
+    n_rings = int(MAX_RADIUS_M / BIN_M)
+    ring = np.minimum((np.sqrt(dx * dx + dy * dy) / BIN_M).astype(np.int64), n_rings - 1)
+    sectors = np.maximum(np.round(2 * np.pi * (np.arange(n_rings) + 0.5)).astype(np.int64), 4)
+    first = np.concatenate([[0], np.cumsum(sectors)])
+    turn = np.arctan2(dy, dx) / np.float32(2 * np.pi) + np.float32(0.5)
+    sector = np.minimum((turn * sectors[ring]).astype(np.int64), sectors[ring] - 1)
+    return first[ring] + sector, int(first[-1])
+
+
+def _bin_centres(points: np.ndarray, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    count = np.maximum(np.bincount(bins, minlength=n_bins), 1)
+    return np.stack([np.bincount(bins, points[:, i], n_bins) / count for i in range(2)], axis=1)
+
+
+def _low_points(points: np.ndarray) -> np.ndarray:
+    """One point (M, 3) for each cell of the plane that holds returns: the mean of its lowest ones."""
+    index = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / np.float32(CELL_M)).astype(np.int64)
+    width = int(index[:, 1].max()) + 1
+    cell = index[:, 0] * width + index[:, 1]
+    n_cells = (int(index[:, 0].max()) + 1) * width
+    lowest = np.full(n_cells, np.inf, dtype=np.float32)
+    np.minimum.at(lowest, cell, points[:, 2])
+    keep = points[:, 2] < lowest[cell] + np.float32(CELL_DEPTH_M)
+    cell, kept = cell[keep], points[keep]
+    count = np.bincount(cell, minlength=n_cells)
+    filled = count > 0
+    sums = np.stack([np.bincount(cell, kept[:, i], n_cells)[filled] for i in range(3)], axis=1)
+    return sums / count[filled, None]
+
+
+def _fit_planes(points: np.ndarray, bins: np.ndarray, n_bins: int) -> Ground:
+    """A plane for each bin through its low points, re-fitted to what lies near it."""
+    low = _lowest(points[:, 2], bins, n_bins)
+    keep = points[:, 2] < (low[bins] + SEED_HEIGHT_M)
+    for _ in range(3):
+        mean, covariance, count = _moments(points[keep], bins[keep], n_bins)
+        eigenvalue, eigenvector = np.linalg.eigh(covariance)
+        normal = eigenvector[:, :, 0] * np.where(eigenvector[:, 2:3, 0] < 0, -1.0, 1.0)
+        height = ((points - mean[bins]) * normal[bins]).sum(axis=1)
+        keep = np.abs(height) < FIT_DISTANCE_M
+    good = (count >= MIN_BIN_CELLS) & (normal[:, 2] > MIN_UPRIGHT)
+    sigma = np.sqrt(np.maximum(eigenvalue[:, 0], 0.0))
+    return _ground(mean[good], normal[good], covariance[good], sigma[good])
+
+
+def _lowest(z: np.ndarray, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """A low but robust height for each bin: the 10 % quantile (stray returns lie below the ground)."""
+    order = np.lexsort((z, bins))
+    count = np.bincount(bins, minlength=n_bins)
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    low = np.full(n_bins, np.inf)
+    filled = count > 0
+    low[filled] = z[order[(start + count // 10)[filled]]]
+    return low
+
+
+def _moments(points: np.ndarray, bins: np.ndarray, n_bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    count = np.bincount(bins, minlength=n_bins)
+    weight = 1.0 / np.maximum(count, 1)
+    origin = points.mean(axis=0, dtype=np.float64) if len(points) else np.zeros(3)
+    p = points.astype(np.float64) - origin  # second moments of map coordinates far from zero would cancel
+    mean = np.stack([np.bincount(bins, p[:, i], n_bins) for i in range(3)], axis=1) * weight[:, None]
+    covariance = np.empty((n_bins, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            second = np.bincount(bins, p[:, i] * p[:, j], n_bins) * weight - mean[:, i] * mean[:, j]
+            covariance[:, i, j] = covariance[:, j, i] = second
+    return mean + origin, covariance, count
+
+
+def _consistent(ground: Ground) -> Ground:
+    """Without the bins that stand above what their neighbours' planes say (car roofs, hedges, walls)."""
+    for _ in range(2):
+        if len(ground.mean) < 9:
+            return ground
+        _, neighbours = ground._tree.query(ground.mean[:, :2], k=9)
+        to_bin = ground.mean[:, None, :] - ground.mean[neighbours[:, 1:]]
+        above = np.median((to_bin * ground.normal[neighbours[:, 1:]]).sum(axis=2), axis=1)
+        good = above < MAX_STEP_M
+        ground = _ground(ground.mean[good], ground.normal[good], ground.covariance[good], ground.sigma[good])
+    return ground
+
+
+def _ground(mean: np.ndarray, normal: np.ndarray, covariance: np.ndarray, sigma: np.ndarray) -> Ground:
+    return Ground(mean, normal, covariance, sigma, cKDTree(mean[:, :2]) if len(mean) else None)

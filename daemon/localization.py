@@ -1,0 +1,130 @@
+"""Corrects odometry by the stored scenes: T_map_odom, by registering key scans to a scene's first visit."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+
+from .config import AlignmentConfig
+from .geometry import inverse, rotation_angle_rad, transform
+from .scenes import Scene
+
+CACHED_REFERENCES = 3  # scenes overlap at their rims; more than that are never in play at once
+MAX_TURN_DEG = 8.0  # a correction that turns the map further is a wrong match, not drift
+MIN_COARSE_TRAVEL_M = 5.0  # metres without a fix before a large drift is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """Where a key scan was: T_map_sensor (4, 4) at its end; aligned says whether a stored scene confirmed it."""
+
+    T_map_sensor: np.ndarray
+    aligned: bool
+    residual_m: float  # root mean square distance to the reference's surface; NaN without a reference
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    T_map_sensor: np.ndarray
+    inlier_ratio: float
+    residual_m: float
+
+
+class Localizer:
+    """Keeps T_map_odom up to date.
+
+    load_reference(scene) gives points (N, 3) float32 of the scene's first visit in the map frame.
+    """
+
+    def __init__(self, config: AlignmentConfig, load_reference: Callable[[Scene], np.ndarray], T_map_odom: np.ndarray):
+        self._config = config
+        self._load_reference = load_reference
+        self._references: OrderedDict[int, tuple[small_gicp.PointCloud, small_gicp.KdTree]] = OrderedDict()
+        self._last_position: np.ndarray | None = None
+        self._travel_since_fix_m = 0.0
+        self.T_map_odom = T_map_odom
+
+    @property
+    def reach_m(self) -> float:
+        """How far off the position may be by drift since the last fix, metres."""
+        return self._config.drift_ratio * self._travel_since_fix_m
+
+    def predict(self, T_odom_sensor: np.ndarray) -> np.ndarray:
+        """T_map_sensor (4, 4) by odometry and the last fix."""
+        return self.T_map_odom @ T_odom_sensor
+
+    def locate(self, points: np.ndarray, T_odom_sensor: np.ndarray, scenes: list[Scene]) -> Fix:
+        """Pose of a key scan with returns (N, 3) float32, deskewed to the sensor frame at its end.
+
+        scenes: the known scenes that the robot may be in, nearest first; without one the prediction stands.
+        """
+        self._travel(T_odom_sensor)
+        predicted = self.predict(T_odom_sensor)
+        reason = "new place"
+        for scene in scenes[:2]:
+            match = self._register(points, predicted, scene)
+            reason = self._objection(match, predicted)
+            if not reason:
+                self.T_map_odom = match.T_map_sensor @ inverse(T_odom_sensor)
+                self._travel_since_fix_m = 0.0
+                return Fix(match.T_map_sensor, True, match.residual_m, "")
+        return Fix(predicted, False, float("nan"), reason)
+
+    def _travel(self, T_odom_sensor: np.ndarray) -> None:
+        position = T_odom_sensor[:3, 3].copy()
+        if self._last_position is not None:
+            self._travel_since_fix_m += float(np.linalg.norm(position - self._last_position))
+        self._last_position = position
+
+    def _register(self, points: np.ndarray, predicted: np.ndarray, scene: Scene) -> _Match:
+        near = points[(points**2).sum(axis=1) < self._config.range_m**2].astype(np.float64)
+        source, _ = small_gicp.preprocess_points(near, self._config.voxel_m * 1.6, 10, 1)
+        gates = [self._config.gate_m]
+        if self._travel_since_fix_m > MIN_COARSE_TRAVEL_M:
+            gates = [self._config.coarse_gate_m, *gates]
+        T = predicted
+        target, tree = self._reference(scene)
+        for gate in gates:
+            T = small_gicp.align(
+                target, source, tree, T, registration_type="GICP", max_correspondence_distance=gate, num_threads=1
+            ).T_target_source
+        return self._judge(T, source, target, tree)
+
+    def _judge(
+        self, T: np.ndarray, source: small_gicp.PointCloud, target: small_gicp.PointCloud, tree: small_gicp.KdTree
+    ) -> _Match:
+        in_map = transform(T, source.points()[:, :3])
+        index, squared = tree.batch_nearest_neighbor_search(in_map, num_threads=1)
+        paired = np.asarray(squared) < self._config.gate_m**2
+        if not paired.any():
+            return _Match(T, 0.0, float("inf"))
+        at = np.asarray(index)[paired]
+        off = ((in_map[paired] - target.points()[at, :3]) * target.normals()[at, :3]).sum(axis=1)
+        return _Match(T, float(paired.mean()), float(np.sqrt((off**2).mean())))
+
+    def _objection(self, match: _Match, predicted: np.ndarray) -> str:
+        """Why a match is not believed; empty when it is."""
+        correction = inverse(predicted) @ match.T_map_sensor
+        moved = float(np.linalg.norm(correction[:3, 3]))
+        turned = np.degrees(rotation_angle_rad(correction))
+        if match.inlier_ratio < self._config.min_inlier_ratio:
+            return f"only {match.inlier_ratio:.0%} of the scan lies on the scene's first visit"
+        if match.residual_m > self._config.max_residual_m:
+            return f"{match.residual_m:.2f} m off the scene's first visit"
+        if moved > self._config.coarse_gate_m + self.reach_m or turned > MAX_TURN_DEG:
+            return f"correction of {moved:.1f} m and {turned:.0f} deg is not believed"
+        return ""
+
+    def _reference(self, scene: Scene) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
+        if scene.scene_id not in self._references:
+            points = self._load_reference(scene).astype(np.float64)
+            self._references[scene.scene_id] = small_gicp.preprocess_points(points, self._config.voxel_m, 12, 1)
+            if len(self._references) > CACHED_REFERENCES:
+                self._references.popitem(last=False)
+        self._references.move_to_end(scene.scene_id)
+        return self._references[scene.scene_id]

@@ -1,0 +1,135 @@
+"""KISS-ICP with input guards and a health verdict: where the sensor is in the odometry's own frame."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..drivers.frame import Frame
+from .config import OdometryConfig
+from .geometry import column_phase, fraction_of, inverse, rotation_angle_rad, transform
+
+# KISSConfig reads kiss_icp_* from the environment; a stray variable must not change a robot's odometry.
+for _name in [name for name in os.environ if name.lower().startswith("kiss_icp_")]:
+    del os.environ[_name]
+
+from kiss_icp.config import KISSConfig  # noqa: E402
+from kiss_icp.kiss_icp import KissICP  # noqa: E402
+
+MIN_POINTS = 1000  # fewer registrable returns than this say nothing about a pose
+CHECK_EVERY = 5  # frames between two looks at the overlap (15 ms each)
+OVERLAP_SAMPLE = 2000
+
+
+class Health(str, Enum):
+    """Verdict on one frame's pose."""
+
+    GOOD = "good"
+    LOST_TOO_FEW_RETURNS = "too few returns"
+    LOST_IMPLAUSIBLE_MOTION = "implausible motion"
+    LOST_NO_OVERLAP = "scan does not lie on the local map"
+    LOST_GAP = "frames missing"
+
+    @property
+    def lost(self) -> bool:
+        return self is not Health.GOOD
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Pose of one frame: T_odom_sensor (4, 4) at the sweep's end, T_start_end (4, 4) the motion during the sweep."""
+
+    T_odom_sensor: np.ndarray
+    T_start_end: np.ndarray
+    health: Health
+
+
+class Odometry:
+    """Registers frames one after another; the odometry's frame is the sensor's pose at the first frame's end."""
+
+    def __init__(self, config: OdometryConfig):
+        self._config = config
+        kiss = KISSConfig()
+        kiss.data.max_range = config.max_range_m
+        kiss.data.min_range = config.min_range_m
+        kiss.mapping.voxel_size = config.voxel_size_m
+        kiss.registration.max_num_threads = 1  # bitwise repeatable, and leaves a core to the detection
+        kiss.registration.max_num_iterations = 50
+        kiss.registration.convergence_criterion = 1e-3
+        self._kiss = KissICP(kiss)
+        self._stamp_ns: int | None = None
+        self._frames = 0
+
+    def register(self, frame: Frame) -> Motion:
+        """The frame's pose. A lost verdict means: start anew with another Odometry."""
+        points, times = self._registrable(frame)
+        previous = self._kiss.last_pose.copy()
+        if len(points) < MIN_POINTS or not times.max() > times.min():
+            return Motion(previous, np.eye(4), Health.LOST_TOO_FEW_RETURNS)
+        gap_frames = self._gap_frames(frame)
+        if gap_frames > MAX_GAP_FRAMES:
+            return Motion(previous, np.eye(4), Health.LOST_GAP)
+        if gap_frames > 1.5:
+            # The constant-velocity guess assumes one period between frames; stretch it over the hole.
+            self._kiss.last_delta = fraction_of(self._kiss.last_delta, gap_frames)
+        self._kiss.register_frame(points, times)
+        T_odom_sensor = self._kiss.last_pose.copy()
+        motion = inverse(previous) @ T_odom_sensor if self._frames else np.eye(4)
+        if gap_frames > 1.5:
+            self._kiss.last_delta = fraction_of(motion, 1.0 / gap_frames)
+        health = self._verdict(motion, gap_frames * frame.sensor.frame_period_ns * 1e-9, points)
+        self._stamp_ns = frame.stamp_ns
+        self._frames += 1
+        return Motion(T_odom_sensor, self._sweep(frame, motion, gap_frames), health)
+
+    def _registrable(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Returns (N, 3) float64 points and (N,) phases on a regular sub-grid of the image."""
+        rows, cols = self._strides(frame.sensor.shape)
+        valid = (frame.range_mm[::rows, ::cols] > 0) & frame.column_valid[None, ::cols]
+        points = frame.sensor.points(frame.range_mm)[::rows, ::cols][valid].astype(np.float64)
+        phase = column_phase(frame.column_ns, frame.column_valid)[::cols]
+        return points, np.broadcast_to(phase, valid.shape)[valid]
+
+    def _strides(self, shape: tuple[int, int]) -> tuple[int, int]:
+        excess = shape[0] * shape[1] / self._config.max_points
+        # Columns are denser than rows on every OS1 but the 128-beam at 512 columns: thin them first.
+        cols = max(1, int(np.ceil(np.sqrt(excess))))
+        rows = max(1, int(np.ceil(excess / cols)))
+        return rows, cols
+
+    def _gap_frames(self, frame: Frame) -> float:
+        if self._stamp_ns is None:
+            return 1.0
+        return (frame.stamp_ns - self._stamp_ns) / frame.sensor.frame_period_ns
+
+    @staticmethod
+    def _sweep(frame: Frame, motion: np.ndarray, gap_frames: float) -> np.ndarray:
+        times = frame.column_ns[frame.column_valid]
+        share = (times.max() - times.min()) / (gap_frames * frame.sensor.frame_period_ns)
+        return fraction_of(motion, min(share, 1.0))
+
+    def _verdict(self, motion: np.ndarray, seconds: float, points: np.ndarray) -> Health:
+        if self._frames == 0:
+            return Health.GOOD
+        speed = np.linalg.norm(motion[:3, 3]) / seconds
+        turn = np.degrees(rotation_angle_rad(motion)) / seconds
+        if speed > self._config.max_speed_mps or turn > self._config.max_turn_dps:
+            return Health.LOST_IMPLAUSIBLE_MOTION
+        if self._frames % CHECK_EVERY == 0 and self._overlap(points) < self._config.min_overlap:
+            return Health.LOST_NO_OVERLAP
+        return Health.GOOD
+
+    def _overlap(self, points: np.ndarray) -> float:
+        """Share of a sample of the scan with a local map point within one voxel's diagonal."""
+        sample = points[:: max(1, len(points) // OVERLAP_SAMPLE)]
+        in_map = transform(self._kiss.last_pose, sample)
+        reach = np.sqrt(3.0) * self._config.voxel_size_m
+        tree = cKDTree(self._kiss.local_map.point_cloud())
+        return float(np.isfinite(tree.query(in_map, distance_upper_bound=reach)[0]).mean())
+
+
+MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth

@@ -1,0 +1,134 @@
+"""The life of one frame, top to bottom: from the sensor's packets to an instance of change detection.
+
+    gate -> odometry -> key scan? -> localization -> descriptor -> scan file and index -> scenes -> instance
+
+What happens to an instance (submaps, detection, change objects) is in instances.py, on the detection thread.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from ..drivers.frame import Frame
+from ..drivers.gate import FrameGate
+from ..models.descriptor import DescriptorModel
+from ..storage.scans import Scan
+from ..storage.store import Store
+from .config import Config
+from .geometry import column_phase, deskew
+from .localization import Fix
+from .odometry import Motion
+from .scenes import SceneUpdate
+from .sensors import Sensors
+from .session import Session
+from .worker import DetectionWorker
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class Counts:
+    """What the pipeline has done since it started."""
+
+    frames: int = 0
+    rejected: int = 0
+    key_scans: int = 0
+    scenes: int = 0
+    instances: int = 0
+    odometry_lost: int = 0
+
+
+class Pipeline:
+    """Takes frames one by one. wait: what to do when the detection lags, wait for it or drop an instance."""
+
+    def __init__(
+        self,
+        config: Config,
+        store: Store,
+        sensors: Sensors,
+        model: DescriptorModel,
+        worker: DetectionWorker,
+        source: str,
+        wait: bool,
+    ):
+        self.counts = Counts()
+        self.gate = FrameGate(config.gate.min_valid_ratio)
+        self._config, self._store, self._sensors = config, store, sensors
+        self._model, self._worker = model, worker
+        self._source, self._wait = source, wait
+        self._session: Session | None = None
+
+    def process(self, frame: Frame) -> None:
+        """One rotation of the sensor."""
+        self.counts.frames += 1
+        if self.gate.check(frame) is not None:
+            self.counts.rejected += 1
+            return
+        session = self._session or self._start_session(frame)
+        motion = session.odometry.register(frame)
+        if motion.health.lost:
+            self._lose_session(motion)
+        elif session.key_scans.wants(motion.T_odom_sensor, frame.stamp_ns):
+            self._keep(session, frame, motion)
+
+    def finish(self) -> None:
+        """The source has ended: close the scene being made and the visits, and queue what is due."""
+        if self._session is not None:
+            self._note(self._session, self._session.scenes.finish())
+            self._store.index.end_session(self._session.session_id)
+            self._session = None
+
+    def _keep(self, session: Session, frame: Frame, motion: Motion) -> None:
+        """A key scan: find where it is, describe it, store it, and tell the scenes."""
+        points = deskew(
+            frame.sensor.points(frame.range_mm), column_phase(frame.column_ns, frame.column_valid), motion.T_start_end
+        )
+        returns = points[(frame.range_mm > 0) & frame.column_valid]
+        fix = session.localizer.locate(returns, motion.T_odom_sensor, session.scenes_to_align_with(motion.T_odom_sensor))
+        scan = self._scan(session, frame, motion, fix)
+        self._store.add_scan(scan)
+        self.counts.key_scans += 1
+        self._note(
+            session, session.scenes.update(scan.scan_id, scan.stamp_ns, fix.T_map_sensor[:2, 3], scan.descriptor)
+        )
+
+    def _scan(self, session: Session, frame: Frame, motion: Motion, fix: Fix) -> Scan:
+        sensor = frame.sensor
+        return Scan(
+            scan_id=self._store.new_scan_id(),
+            session=session.session_id,
+            stamp_ns=frame.stamp_ns,
+            host_ns=frame.host_ns,
+            frame_id=frame.frame_id,
+            sensor_digest=sensor.digest,
+            range_mm=frame.range_mm,
+            reflectivity=frame.reflectivity,
+            column_ns=frame.column_ns,
+            column_valid=frame.column_valid,
+            T_map_sensor=fix.T_map_sensor,
+            T_odom_sensor=motion.T_odom_sensor,
+            T_start_end=motion.T_start_end,
+            descriptor=self._model.describe(frame.range_mm, sensor.pixel_shift, sensor.altitude_rad),
+            model_id=self._model.model_id,
+            aligned=fix.aligned,
+            alignment_residual_m=fix.residual_m,
+        )
+
+    def _note(self, session: Session, update: SceneUpdate) -> None:
+        """Store new scenes and ended visits, and queue an instance for each visit to a known scene."""
+        self.counts.scenes += update.new_scene is not None
+        for instance in session.record(update):
+            self.counts.instances += 1
+            self._worker.submit(instance, self._wait)
+
+    def _start_session(self, frame: Frame) -> Session:
+        self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source)
+        logger.info("session %d starts sensor=%s", self._session.session_id, frame.sensor.serial)
+        return self._session
+
+    def _lose_session(self, motion: Motion) -> None:
+        """Without odometry nothing may be compared across the break: close the session; the next frame starts one."""
+        logger.warning("odometry lost: %s", motion.health.value)
+        self.counts.odometry_lost += 1
+        self.finish()

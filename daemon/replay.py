@@ -1,0 +1,92 @@
+"""A recorded or live source through the whole program: the same path for both."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..drivers.frame import Frame
+from ..drivers.gate import FrameGate
+from ..drivers.ouster import Source, open_source
+from ..models.descriptor import DescriptorModel
+from ..storage.store import Store
+from .config import Config, dump_config
+from .instances import ChangeDetection
+from .pipeline import Counts, Pipeline
+from .sensors import Sensors
+from .worker import DetectionWorker
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What one run did."""
+
+    counts: Counts
+    losses: dict[str, int]  # packets, columns and frames lost, by cause
+    instances_done: int
+    instances_failed: int
+    instances_dropped: int
+    changes: int
+    seconds: float
+
+
+class NothingUsable(Exception):
+    """The source ended without a frame that could be used; the message says why."""
+
+
+Progress = Callable[[Counts, int, int | None], None]  # counts, changes, frames expected; called for each frame
+
+
+def replay(
+    source: str, data: Path, meta: Path | None, config: Config, rate: float | None, progress: Progress
+) -> Summary:
+    """Run a source to its end. rate None: as fast as it goes, nothing is dropped; else a multiple of real time.
+
+    Raises DriverError for a source that cannot be read, NothingUsable, and the storage's errors.
+    """
+    start = time.perf_counter()
+    with open_source(source, meta) as frames, Store.open_writer(data) as store:
+        (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
+        sensors = Sensors(store.dir)
+        detection = ChangeDetection(config, store, sensors)
+        worker = DetectionWorker(detection.run, config.worker.queue_size)
+        try:
+            pipeline = Pipeline(config, store, sensors, DescriptorModel.load(), worker, source, wait=rate is None)
+            for frame in _paced(frames, rate):
+                pipeline.process(frame)
+                progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
+            pipeline.finish()
+            worker.drain()
+        finally:
+            worker.close()
+        progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
+        losses = {**frames.losses, **pipeline.gate.counts}
+        if pipeline.counts.frames == pipeline.counts.rejected:
+            raise NothingUsable(_why_nothing(source, pipeline.counts, pipeline.gate))
+        return Summary(
+            pipeline.counts,
+            {cause: count for cause, count in losses.items() if count},
+            worker.done,
+            worker.failed,
+            worker.dropped,
+            detection.n_changes,
+            time.perf_counter() - start,
+        )
+
+
+def _paced(frames: Source, rate: float | None):
+    """Frames at a multiple of the speed at which the sensor made them."""
+    first: tuple[float, int] | None = None
+    for frame in frames:
+        if rate is not None and frame.column_valid.any():
+            first = first or (time.monotonic(), frame.stamp_ns)
+            due = first[0] + (frame.stamp_ns - first[1]) * 1e-9 / rate
+            time.sleep(max(0.0, due - time.monotonic()))
+        yield frame
+
+
+def _why_nothing(source: str, counts: Counts, gate: FrameGate) -> str:
+    causes = ", ".join(f"{count} x {cause}" for cause, count in gate.counts.items() if count)
+    return f"{source}: none of its {counts.frames} frames could be used ({causes})"

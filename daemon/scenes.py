@@ -1,0 +1,146 @@
+"""Scene identification (CDSD Algorithm 1) and the visits to each scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .config import SceneConfig
+from .hull import convex_hull, distance_m, grown_area_m2
+
+
+@dataclass(eq=False)
+class Scene:
+    """A bounded region of the trajectory: a convex hull in the map's xy plane, grown by a margin."""
+
+    scene_id: int
+    hull: np.ndarray  # (M, 2) metres, map frame
+    n_visits: int = 1
+
+
+@dataclass(eq=False)
+class Visit:
+    """One stay in a scene, from entry to exit."""
+
+    scene_id: int
+    number: int  # v of the paper: 1 is the visit that made the scene
+    t_in_ns: int
+    t_out_ns: int
+    scan_ids: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneUpdate:
+    """What one key scan did: a scene that came to be, and visits that ended."""
+
+    new_scene: Scene | None
+    ended_visits: list[Visit]
+
+
+class SceneTracker:
+    """Builds scenes while the robot explores, and notes visits to the scenes that stand.
+
+    Memory: one polygon for each scene of the map (some hundred bytes for 20 m of path), and the descriptors of
+    the scene that is being built.
+    """
+
+    def __init__(self, config: SceneConfig, scenes: list[Scene], next_scene_id: int):
+        self._config = config
+        self._scenes = {scene.scene_id: scene for scene in scenes}
+        self._next_scene_id = next_scene_id
+        self._open_visits: dict[int, Visit] = {}
+        self._clear_current()
+
+    @property
+    def open_visits(self) -> dict[int, Visit]:
+        """Visits that go on, by scene id."""
+        return self._open_visits
+
+    def scenes_near(self, xy: np.ndarray, reach_m: float) -> list[Scene]:
+        """Scenes whose grown hull lies within reach of a position (2,), nearest first."""
+        reach = self._config.margin_m + reach_m
+        distances = {scene.scene_id: distance_m(scene.hull, xy) for scene in self._scenes.values()}
+        return [self._scenes[i] for i in sorted(distances, key=distances.get) if distances[i] <= reach]
+
+    def update(self, scan_id: int, stamp_ns: int, xy: np.ndarray, descriptor: np.ndarray) -> SceneUpdate:
+        """Take a key scan at xy (2,) metres in the map, descriptor (256,)."""
+        ended = self._leave_scenes(xy) + self._cut_long_visits(stamp_ns)
+        inside = self.scenes_near(xy, 0.0)
+        self._stay_in(inside, scan_id, stamp_ns)
+        new_scene = self._grow_current(scan_id, stamp_ns, xy, descriptor, bool(inside))
+        return SceneUpdate(new_scene, ended)
+
+    def finish(self) -> SceneUpdate:
+        """The session ends: close the scene being built and every open visit."""
+        new_scene = self._close_current() if self._hull is not None else None
+        ended = list(self._open_visits.values())
+        self._open_visits = {}
+        return SceneUpdate(new_scene, ended)
+
+    # Algorithm 1 ------------------------------------------------------------------------------------------------
+
+    def _grow_current(
+        self, scan_id: int, stamp_ns: int, xy: np.ndarray, descriptor: np.ndarray, inside: bool
+    ) -> Scene | None:
+        if self._hull is None:
+            if not inside:  # lines 4-5: no new scene while in an old one
+                self._start_current(scan_id, stamp_ns, xy, descriptor)
+            return None
+        hull = convex_hull(np.vstack([self._hull, xy]))  # line 7
+        too_large = grown_area_m2(hull, self._config.margin_m) > self._config.alpha_m2
+        spread = np.linalg.norm(np.array(self._descriptors) - descriptor, axis=1).max()
+        too_long = stamp_ns - self._current.t_in_ns > self._config.max_visit_s * 1e9
+        if not (too_large or too_long) and spread <= self._config.beta:  # line 8
+            self._hull = hull  # line 17
+            self._descriptors.append(descriptor)
+            self._current.scan_ids.append(scan_id)
+            self._current.t_out_ns = stamp_ns
+            return None
+        scene = self._close_current()  # line 9
+        if distance_m(scene.hull, xy) <= self._config.margin_m:  # lines 11-12
+            self._stay_in([scene], scan_id, stamp_ns)
+        elif not inside:  # line 14
+            self._start_current(scan_id, stamp_ns, xy, descriptor)
+        return scene
+
+    def _start_current(self, scan_id: int, stamp_ns: int, xy: np.ndarray, descriptor: np.ndarray) -> None:
+        self._hull = convex_hull(xy)
+        self._descriptors = [descriptor]
+        self._current = Visit(self._next_scene_id, 1, stamp_ns, stamp_ns, [scan_id])
+        self._next_scene_id += 1
+
+    def _close_current(self) -> Scene:
+        scene = Scene(self._current.scene_id, self._hull)
+        self._scenes[scene.scene_id] = scene
+        # The robot is still inside: the visit that made the scene goes on until it leaves.
+        self._open_visits[scene.scene_id] = self._current
+        self._clear_current()
+        return scene
+
+    def _clear_current(self) -> None:
+        self._hull: np.ndarray | None = None
+        self._descriptors: list[np.ndarray] = []
+        self._current: Visit | None = None
+
+    # Visits -----------------------------------------------------------------------------------------------------
+
+    def _stay_in(self, inside: list[Scene], scan_id: int, stamp_ns: int) -> None:
+        for scene in inside:
+            if scene.scene_id not in self._open_visits:
+                scene.n_visits += 1
+                self._open_visits[scene.scene_id] = Visit(scene.scene_id, scene.n_visits, stamp_ns, stamp_ns)
+        for scene_id, visit in self._open_visits.items():
+            if not visit.scan_ids or visit.scan_ids[-1] != scan_id:
+                visit.scan_ids.append(scan_id)
+                visit.t_out_ns = stamp_ns
+
+    def _leave_scenes(self, xy: np.ndarray) -> list[Visit]:
+        reach = self._config.margin_m + self._config.exit_margin_m
+        left = [i for i in self._open_visits if distance_m(self._scenes[i].hull, xy) > reach]
+        return [self._open_visits.pop(i) for i in left]
+
+    def _cut_long_visits(self, stamp_ns: int) -> list[Visit]:
+        limit_ns = self._config.max_visit_s * 1e9
+        long = [i for i, visit in self._open_visits.items() if stamp_ns - visit.t_in_ns > limit_ns]
+        return [self._open_visits.pop(i) for i in long]

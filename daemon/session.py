@@ -1,0 +1,78 @@
+"""One session: a run of the odometry without a break, and what it knows of the map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import __version__
+from ..drivers.frame import Sensor
+from ..storage.store import Store
+from .config import Config, dump_config
+from .hull import grown_area_m2
+from .keyscans import KeyScanRule
+from .localization import Localizer
+from .odometry import Odometry
+from .scenes import Scene, SceneTracker, SceneUpdate
+from .sensors import Sensors
+from .views import map_points
+from .worker import Instance
+
+REFERENCE_SCANS = 10  # of a scene's first visit, evenly spread: enough surface to register to
+
+
+class Session:
+    """The parts that begin anew when the odometry does."""
+
+    def __init__(self, config: Config, store: Store, sensors: Sensors, sensor: Sensor, source: str):
+        self._config = config
+        self._store = store
+        self._sensors = sensors
+        sensors.put(sensor)
+        self.session_id = store.index.start_session(
+            source=source,
+            sensor_digest=sensor.digest,
+            serial=sensor.serial,
+            product=sensor.product,
+            firmware=sensor.firmware,
+            profile=sensor.profile,
+            clock_source="sensor",
+            config=dump_config(config),
+            software_version=__version__,
+        )
+        self.map_id = self.session_id
+        self.odometry = Odometry(config.odometry)
+        self.key_scans = KeyScanRule(config.keyscans)
+        self.localizer = Localizer(config.alignment, self._load_reference, np.eye(4))
+        self.scenes = SceneTracker(config.scenes, [], store.index.next_scene_id())
+
+    def scenes_to_align_with(self, T_odom_sensor: np.ndarray) -> list[Scene]:
+        """Known scenes that the robot may be in, nearest first, but not those it is still making."""
+        xy = self.localizer.predict(T_odom_sensor)[:2, 3]
+        being_made = {visit.scene_id for visit in self.scenes.open_visits.values() if visit.number == 1}
+        near = self.scenes.scenes_near(xy, self.localizer.reach_m)
+        return [scene for scene in near if scene.scene_id not in being_made]
+
+    def record(self, update: SceneUpdate) -> list[Instance]:
+        """Store what a key scan did to the scenes; the instances that are due: each visit but a scene's first."""
+        index, due = self._store.index, []
+        with index.transaction():
+            if update.new_scene is not None:
+                hull, margin = update.new_scene.hull, self._config.scenes.margin_m
+                area = grown_area_m2(hull, margin)
+                index.add_scene(update.new_scene.scene_id, self.map_id, hull, margin, area)
+            for visit in update.ended_visits:
+                visit_id = index.open_visit(visit.scene_id, visit.number, self.session_id, visit.t_in_ns)
+                index.add_visit_scans(visit_id, visit.scan_ids)
+                index.close_visit(visit_id, visit.t_out_ns)
+                if visit.number >= 2:
+                    where = (self.session_id, self.map_id, visit.scene_id, visit_id, visit.number)
+                    due.append(Instance(*where, visit.t_in_ns, visit.t_out_ns))
+        return due
+
+    def _load_reference(self, scene: Scene) -> np.ndarray:
+        """Points (N, 3) float32 of the scene's first visit, map frame."""
+        first = self._store.index.scans_of_scene(scene.scene_id, visit=1)
+        chosen = np.unique(np.linspace(0, len(first.scan_id) - 1, REFERENCE_SCANS).round().astype(int))
+        scans = [self._store.scans.read(int(first.session[i]), int(first.scan_id[i])) for i in chosen]
+        range_m = self._config.alignment.range_m
+        return np.concatenate([map_points(scan, self._sensors.get(scan.sensor_digest), range_m) for scan in scans])
