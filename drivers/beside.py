@@ -62,7 +62,7 @@ def _match_named(capture: Path, path: Path) -> tuple[Metadata, Survey, Verdict]:
     if fault:
         raise fault
     verdict = survey.verdicts[0]
-    if not verdict.good:
+    if not verdict.fits:
         raise survey.error(verdict, path.name)
     return metadata, survey, verdict
 
@@ -75,9 +75,9 @@ def _match_beside(capture: Path) -> tuple[Metadata, Survey, Verdict]:
     fitting, doubtful = [], []
     for candidate, verdict in zip(candidates, survey.verdicts, strict=True):
         related = _is_related(capture, candidate.path)
-        if verdict.good and (related or verdict.filter.has_ids):
+        if verdict.fits and (related or verdict.filter.has_ids):
             fitting.append((candidate, verdict))
-        elif verdict.good:
+        elif verdict.fits:
             doubtful.append(candidate.path.name)
         elif related:
             unfit.append(survey.error(verdict, candidate.path.name))

@@ -15,6 +15,7 @@ class Loss(str, Enum):
     OTHER_SENSOR = "other sensor"  # another serial
     OTHER_INIT_ID = "other init id"  # the same sensor, but restarted or reconfigured since the metadata
     WRONG_SIZE = "wrong size"
+    WRONG_COLUMN = "wrong column"  # beyond those of a rotation: recorded in another lidar mode
     BAD_CHECKSUM = "bad checksum"
     IMU_PACKET = "IMU packet"  # not used
     ZONE_PACKET = "zone packet"  # not used

@@ -11,6 +11,7 @@ from .frame import Frame, Sensor
 from .losses import Loss
 
 FIELDS = ("RANGE", "REFLECTIVITY")
+COLUMN_ID_OFFSET = 8  # of the measurement id in a column's header, in all profiles
 CHECKSUM_TRIAL_PACKETS = 64  # firmware before 2.5 fills in something else: checksums count once one is right
 RESTART_PACKETS = 8  # so many in a row that are too old: not late ones, but frame ids that begin again
 
@@ -25,7 +26,9 @@ class PacketFilter:
         self.has_ids = info.format.udp_profile_lidar != core.UDPProfileLidar.LEGACY
         self.profile = str(info.format.udp_profile_lidar)
         self.beams = info.format.pixels_per_column
+        self.columns = info.format.columns_per_frame
         self.expected_ids = (info.sn, info.init_id)
+        self._column_at = self.format.packet_header_size + COLUMN_ID_OFFSET
         self._by_port = {info.config.udp_port_imu: Loss.IMU_PACKET, info.config.udp_port_zm: Loss.ZONE_PACKET}
         self._by_size = {
             self.format.imu_packet_size: Loss.IMU_PACKET,
@@ -38,12 +41,10 @@ class PacketFilter:
             return self._by_port.get(port, Loss.OTHER_PORT)
         if len(payload) != self.size:
             return self._by_size.get(len(payload), Loss.WRONG_SIZE)
-        if not self.has_ids:
-            return None
-        ids = self.ids(payload)
-        if ids == self.expected_ids:
-            return None
-        return Loss.OTHER_INIT_ID if ids[0] == self.expected_ids[0] else Loss.OTHER_SENSOR
+        if self.has_ids and (ids := self.ids(payload)) != self.expected_ids:
+            return Loss.OTHER_INIT_ID if ids[0] == self.expected_ids[0] else Loss.OTHER_SENSOR
+        column = int.from_bytes(payload[self._column_at : self._column_at + 2], "little")
+        return Loss.WRONG_COLUMN if column >= self.columns else None
 
     def ids(self, payload: bytes) -> tuple[int, int]:
         """payload of `size` bytes -> serial, init id; both 0 in the LEGACY profile."""
@@ -95,7 +96,12 @@ class FrameAssembler:
         self._late = 0
 
     def _batch(self, packet: core.LidarPacket) -> Iterator[core.LidarFrame]:
-        if self._batcher.batch(packet, self._frame):
+        try:
+            complete = self._batcher.batch(packet, self._frame)
+        except RuntimeError:  # what the SDK does with a late packet where frame ids have 32 bits
+            self._losses[Loss.LATE_PACKET] += 1
+            return
+        if complete:
             self._count_late()
             yield self._frame
             self._frame = core.LidarFrame(self._info, self._field_types)

@@ -31,6 +31,11 @@ class Verdict:
     other_ids: Counter = field(default_factory=Counter)  # (serial, init id) of packets that fit but for those
     good: int = 0
 
+    @property
+    def fits(self) -> bool:
+        """Whether the packets are those of the metadata; stray columns are tolerated, half a turn is not."""
+        return self.good > 10 * self.faults[Loss.WRONG_COLUMN]
+
     def add(self, payload: bytes, sender: bytes, port: int) -> None:
         fault = self.filter.fault(payload, port)
         if fault is None:
@@ -70,7 +75,7 @@ class Survey:
             self.has_ouster_packets |= _looks_like_ouster(datagram.payload)
             for verdict in self.verdicts:
                 verdict.add(datagram.payload, sender, datagram.port)
-            if self.datagrams >= MOST or self.datagrams >= ENOUGH and any(v.good for v in self.verdicts):
+            if self.datagrams >= MOST or self.datagrams >= ENOUGH and any(v.fits for v in self.verdicts):
                 return
 
     def _counted(self, file: PcapFile) -> Iterator[Record]:
@@ -114,11 +119,17 @@ class Survey:
                 f"{metadata} is for packets of {expected.size} bytes ({expected.profile}, {expected.beams} "
                 f"beams), but {here} has none: give the metadata saved with it; {seen}"
             )
+        if verdict.faults[Loss.WRONG_COLUMN]:
+            return BadMetadata(
+                f"{metadata} has {expected.columns} columns a turn, but {here} was recorded with more: give "
+                f"the metadata saved with it; {seen}"
+            )
         if set(verdict.faults) <= {Loss.IMU_PACKET, Loss.ZONE_PACKET}:
             return BadCapture(f"{here} holds no lidar packets: the lidar was off; {seen}")
         port = f"port {expected.port}, where {metadata} has the lidar" if expected.port else "any port"
         return BadCapture(
-            f"{here} holds no lidar packets at {port}: another sensor, a wrong port, or the lidar was off; {seen}"
+            f"{here} holds no lidar packets at {port}: another sensor, a wrong port, or the lidar was off; "
+            f"{seen}"
         )
 
 
