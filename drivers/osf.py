@@ -13,13 +13,11 @@ from .errors import BadCapture, BadMetadata
 from .frame import Frame
 from .losses import Loss
 from .metadata import parse_metadata, sensor_from_info
-from .packets import FIELDS, frame_from_sdk
+from .packets import FIELDS
 from .source import Source
 
 MAX_BLOCK_BYTES = 64 << 20
 METADATA_OFFSET_ENTRY = 4 + 2 * 2  # in the header's vtable: its third field
-
-
 
 
 class OsfSource(Source):
@@ -46,9 +44,9 @@ class OsfSource(Source):
                 if len(self._warnings) > n_warnings:  # a field could not be decoded, and is zero
                     n_warnings = len(self._warnings)
                     self.losses[Loss.DAMAGED_RECORD] += 1
-                elif lidar_frame and (frame := self._frame(lidar_frame)):
+                elif lidar_frame and self._is_ours(lidar_frame):
                     n_frames += 1
-                    yield frame
+                    yield from self._frames(lidar_frame)
         except RuntimeError as error:
             raise BadCapture(f"{self._path} cannot be read beyond frame {n_frames}: {error}") from None
         if not n_frames:
@@ -93,14 +91,12 @@ class OsfSource(Source):
             raise BadMetadata(f"{self._path} holds sensors {serials}: say which with --meta")
         return 0, parse_metadata(infos[0].to_json_string())
 
-    def _frame(self, lidar_frame: core.LidarFrame) -> Frame | None:
-        if (lidar_frame.h, lidar_frame.w) != self.sensor.shape or not lidar_frame.has_field("RANGE"):
+    def _is_ours(self, lidar_frame: core.LidarFrame) -> bool:
+        """Whether it has the shape of the metadata, and ranges."""
+        ours = (lidar_frame.h, lidar_frame.w) == self.sensor.shape and lidar_frame.has_field("RANGE")
+        if not ours:
             self.losses[Loss.DAMAGED_RECORD] += 1
-            return None
-        frame = frame_from_sdk(lidar_frame, self.sensor)
-        if not frame:
-            self.losses[Loss.EMPTY_FRAME] += 1
-        return frame
+        return ours
 
 
 def _fault(path: Path) -> str | None:

@@ -35,7 +35,7 @@ class PacketFilter:
             self.format.zone_packet_size: Loss.ZONE_PACKET,
         }
 
-    def fault(self, payload: bytes, port: int) -> Loss | None:
+    def fault(self, payload: bytes | np.ndarray, port: int) -> Loss | None:
         """payload, and the UDP port it was sent to -> why it is of no use, or None."""
         if self.port and port != self.port:
             return self._by_port.get(port, Loss.OTHER_PORT)
@@ -46,7 +46,7 @@ class PacketFilter:
         column = int.from_bytes(payload[self._column_at : self._column_at + 2], "little")
         return Loss.WRONG_COLUMN if column >= self.columns else None
 
-    def ids(self, payload: bytes) -> tuple[int, int]:
+    def ids(self, payload: bytes | np.ndarray) -> tuple[int, int]:
         """payload of `size` bytes -> serial, init id; both 0 in the LEGACY profile."""
         return self.format.prod_sn(payload), self.format.init_id(payload)
 
@@ -67,11 +67,15 @@ class FrameAssembler:
         self._checksum_trials = 0
         self._begin()
 
-    def add(self, payload: bytes, host_ns: int) -> Iterator[core.LidarFrame]:
-        """Takes one packet, received at host_ns; yields each frame that it completes."""
+    def packet(self, payload: bytes, host_ns: int) -> core.LidarPacket:
+        """The payload of a datagram that was received at host_ns, for add()."""
         packet = core.LidarPacket(self._format)
         packet.buf[:] = np.frombuffer(payload, np.uint8)
         packet.host_timestamp = max(host_ns, 1)  # at 0 the batcher completes no frame before the next begins
+        return packet
+
+    def add(self, packet: core.LidarPacket) -> Iterator[core.LidarFrame]:
+        """Takes one packet and yields each frame that it completes."""
         if self._is_corrupt(packet):
             self._losses[Loss.BAD_CHECKSUM] += 1
         elif not self._is_too_old(packet.frame_id()):

@@ -4,7 +4,11 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
 
+from ouster.sdk.core import LidarFrame
+
 from .frame import Frame, Sensor
+from .losses import Loss
+from .packets import frame_from_sdk
 
 
 class Source(ABC):
@@ -21,6 +25,13 @@ class Source(ABC):
     @abstractmethod
     def close(self) -> None:
         """Frees the file or socket. May be called twice."""
+
+    def _frames(self, lidar_frame: LidarFrame) -> Iterator[Frame]:
+        frame = frame_from_sdk(lidar_frame, self.sensor)
+        if frame:
+            yield frame
+        else:
+            self.losses[Loss.EMPTY_FRAME] += 1
 
     def __enter__(self) -> "Source":
         return self
