@@ -220,6 +220,14 @@ class IndexStore:
             descriptors=_descriptors([row[13] for row in rows]),
         )
 
+    def latest_visit_numbers(self) -> dict[int, int]:
+        """Scan id -> the highest number among the visits it is part of; scans outside all scenes are left out."""
+        return dict(
+            self._db.tuples(
+                "SELECT scan_id, max(number) FROM visit_scans JOIN visits USING (visit_id) GROUP BY scan_id"
+            )
+        )
+
     # Instances ----------------------------------------------------------------------------------------------------
 
     def record_instance(self, instance: InstanceRow) -> int:
