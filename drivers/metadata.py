@@ -15,6 +15,11 @@ MAX_BEAMS = 256
 MAX_COLUMNS = 8192
 MAX_COORDINATE_MM = 1e4  # of a sensor's own parts: no Ouster is 10 m wide
 NO_LIDAR_PROFILE = "OFF"
+# Parts that frames do not depend on; the SDK takes them seriously enough to print about them.
+UNUSED_PARTS = ("user_data", "zone_set", "ouster-sdk")
+# The SDK's patterns crash the process on a long string; nothing in a sensor's metadata comes near.
+MAX_TEXT = 500
+MAX_DEPTH = 8
 
 
 def sensor_from_metadata(json_text: str) -> Sensor:
@@ -33,11 +38,15 @@ def parse_metadata(json_text: str) -> core.SensorInfo:
         raise BadMetadata(f"metadata is not JSON: {_one_line(error)}") from None
     if not isinstance(document, dict):
         raise BadMetadata("metadata is not a JSON object; give the answer of http://SENSOR/api/v1/sensor/metadata")
+    used = {key: value for key, value in document.items() if key not in UNUSED_PARTS}
+    if not _is_digestible(used):
+        raise BadMetadata("metadata is malformed: it holds a text, list or nesting that is far too long")
     try:
-        info = core.SensorInfo(json_text)
+        info = core.SensorInfo(json.dumps(used, ensure_ascii=False))
+        fault = _fault(info)
+        core.PacketFormat.from_info(info)
     except (RuntimeError, ValueError, TypeError, OverflowError, IndexError, KeyError, MemoryError) as error:
         raise BadMetadata(f"metadata is malformed: {_one_line(error)}") from None
-    fault = _fault(info)
     if fault:
         raise BadMetadata(f"metadata is not usable: {fault}")
     return info
@@ -77,6 +86,16 @@ def geometry_digest(info: core.SensorInfo) -> str:
     return hashlib.sha256(geometry).hexdigest()[:16]
 
 
+def _is_digestible(value: object, depth: int = 0) -> bool:
+    """Whether all texts, lists and nestings are of a length that the SDK survives."""
+    if isinstance(value, dict):
+        value = [*value, *value.values()]
+    if isinstance(value, list):
+        short = depth < MAX_DEPTH and len(value) <= MAX_BEAMS
+        return short and all(_is_digestible(part, depth + 1) for part in value)
+    return not isinstance(value, str) or len(value) <= MAX_TEXT
+
+
 def _fault(info: core.SensorInfo) -> str | None:
     """What makes this metadata useless, or None."""
     data = info.format
@@ -111,8 +130,9 @@ def _transform_fault(info: core.SensorInfo) -> str | None:
     for name in ("beam_to_lidar_transform", "lidar_to_sensor_transform"):
         transform = np.asarray(getattr(info, name))
         rotation = transform[:3, :3]
-        rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
-        if not rigid or not (np.abs(transform[:3, 3]) <= MAX_COORDINATE_MM).all():
+        rigid = (np.abs(transform) <= MAX_COORDINATE_MM).all()
+        rigid = rigid and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        if not rigid or np.linalg.det(rotation) < 0:
             return f"{name} is not a rigid transform"
     return None
 
@@ -120,4 +140,4 @@ def _transform_fault(info: core.SensorInfo) -> str | None:
 def _one_line(error: Exception) -> str:
     """The SDK's message without its headline and line breaks."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return "; ".join(line for line in lines if not line.startswith("ERROR: Critical")) or type(error).__name__
+    return "; ".join(line for line in lines if not line.startswith("ERROR: Critical"))[:MAX_TEXT]

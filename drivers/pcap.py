@@ -53,6 +53,12 @@ class PcapFile:
     def close(self) -> None:
         self._file.close()
 
+    def __enter__(self) -> "PcapFile":
+        return self
+
+    def __exit__(self, *_exception) -> None:
+        self.close()
+
 
 def _open_records(file: BinaryIO, path: Path, size: int, losses: Counter) -> Iterator[Record]:
     if size == 0:

@@ -60,12 +60,9 @@ class Survey:
         self.records = 0
         self.datagrams = 0
         self.has_ouster_packets = False
-        file = PcapFile(path, self.losses)
-        try:
+        with PcapFile(path, self.losses) as file:
             self._read(file)
             self.bytes_read, self.size = file.position(), file.size
-        finally:
-            file.close()
 
     def _read(self, file: PcapFile) -> None:
         for datagram in Reassembler(self.losses).datagrams(self._counted(file)):
