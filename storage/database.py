@@ -10,7 +10,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -25,8 +25,9 @@ BUSY_TIMEOUT_S = 5.0  # a reader's checkpoint or backup may hold the file so lon
 class Connection:
     """One connection, with its lock."""
 
-    def __init__(self, connection: sqlite3.Connection):
+    def __init__(self, connection: sqlite3.Connection, path: Path, writes: bool):
         self._db = sqlite_utils.Database(connection)
+        self._path, self._writes = path, writes
         self._lock = threading.RLock()
 
     @contextmanager
@@ -76,9 +77,20 @@ class Connection:
             return self._db.execute(sql, values).fetchone()[0]
 
     def close(self) -> None:
-        """Close the file; the last one to close it folds the WAL into it."""
+        """Close the file; a writer leaves all that was written in the file itself, and an empty WAL beside it.
+
+        SQLite would delete -wal and -shm with the last connection, and a reader who may not write to the directory
+        (another user's planner) could not open the file then. A read-only connection that closes last keeps them.
+        """
         with self._lock:
-            self._db.close()
+            if not self._writes:
+                self._db.close()
+                return
+            self._db.execute("PRAGMA busy_timeout = 0")  # a reader at work: leave it the WAL as it is
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            with closing(_connect_read_only(self._path)) as keeper:
+                keeper.execute("PRAGMA user_version")
+                self._db.close()
 
 
 def open_writer(path: Path, migrations: Sequence[str], synchronous: str, store_uuid: str) -> Connection:
@@ -100,7 +112,7 @@ def open_writer(path: Path, migrations: Sequence[str], synchronous: str, store_u
         except BaseException:
             connection.close()
             raise
-    return Connection(connection)
+    return Connection(connection, path, writes=True)
 
 
 def open_reader(path: Path, n_migrations: int) -> Connection:
@@ -108,15 +120,19 @@ def open_reader(path: Path, n_migrations: int) -> Connection:
     if not Path(path).exists():
         raise DatabaseFileError(f"{path}: no such file")
     with _naming(path):
-        uri = f"file:{quote(str(Path(path).absolute()))}?mode=ro"
-        connection = sqlite3.connect(uri, BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False, uri=True)
+        connection = _connect_read_only(path)
         try:
             if _refuse_newer(connection, path, n_migrations) < n_migrations:
                 raise DatabaseFileError(f"{path}: not yet brought to this version's schema: start the writer once")
         except BaseException:
             connection.close()
             raise
-    return Connection(connection)
+    return Connection(connection, path, writes=False)
+
+
+def _connect_read_only(path: Path) -> sqlite3.Connection:
+    uri = f"file:{quote(str(Path(path).absolute()))}?mode=ro"
+    return sqlite3.connect(uri, BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False, uri=True)
 
 
 def _migrate(connection: sqlite3.Connection, path: Path, migrations: Sequence[str]) -> None:

@@ -191,6 +191,39 @@ def test_readers_see_whole_changes_while_they_are_written(store, path):
     assert len(store.changes()) == 60
 
 
+def test_after_the_writer_has_gone_the_file_alone_holds_everything(path, tmp_path):
+    store = ChangeStore.open_writer(path, UUID)
+    store.add(make_change())
+    store.close()
+    copy = tmp_path / "copy.db"
+    copy.write_bytes(path.read_bytes())
+    reader = ChangeStore.open_reader(copy)
+    assert len(reader.changes()) == 1
+    reader.close()
+
+
+def test_readers_who_may_not_write_to_the_directory_find_what_they_need(path):
+    ChangeStore.open_writer(path, UUID).close()
+    beside = {entry.name for entry in path.parent.iterdir()}
+    assert {"changes.db-wal", "changes.db-shm"} <= beside, "SQLite cannot open the file read-only without them"
+    ChangeStore.open_reader(path).close()
+    assert {entry.name for entry in path.parent.iterdir()} == beside
+
+
+def test_a_writer_closes_although_a_reader_is_in_the_middle_of_reading(path):
+    store = ChangeStore.open_writer(path, UUID)
+    store.add(make_change())
+    reader = sqlite3.connect(path, isolation_level=None)
+    reader.execute("BEGIN")
+    assert reader.execute("SELECT count(*) FROM changes").fetchone() == (1,)
+    store.add(make_change())
+    store.close()
+    assert reader.execute("SELECT count(*) FROM changes").fetchone() == (1,)
+    reader.execute("COMMIT")
+    assert reader.execute("SELECT count(*) FROM changes").fetchone() == (2,)
+    reader.close()
+
+
 @pytest.mark.parametrize("version", range(1, len(CHANGES_MIGRATIONS) + 1))
 def test_changes_of_every_past_version_open(path, version):
     connection = sqlite3.connect(path)
