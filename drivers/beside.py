@@ -64,6 +64,7 @@ def _match_named(capture: Path, path: Path) -> tuple[Metadata, Survey, Verdict]:
     verdict = survey.verdicts[0]
     if not verdict.fits:
         raise survey.error(verdict, path.name)
+    survey.require_one_sender(verdict)
     return metadata, survey, verdict
 
 
@@ -86,6 +87,7 @@ def _match_beside(capture: Path) -> tuple[Metadata, Survey, Verdict]:
         raise BadMetadata(f"{capture} fits several metadata files, give the right one with --meta: {names}")
     if not fitting:
         raise _nothing_beside(capture, survey, doubtful, unfit)
+    survey.require_one_sender(fitting[0][1])
     return fitting[0][0], survey, fitting[0][1]
 
 

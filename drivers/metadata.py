@@ -20,6 +20,19 @@ UNUSED_PARTS = ("user_data", "zone_set", "ouster-sdk")
 # The SDK's patterns crash the process on a long string; nothing in a sensor's metadata comes near.
 MAX_TEXT = 500
 MAX_DEPTH = 8
+STATED_GEOMETRY = (
+    "beam_altitude_angles",
+    "beam_azimuth_angles",
+    "beam_to_lidar_transform",
+    "lidar_to_sensor_transform",
+)
+STATED_FORMAT = (
+    "pixels_per_column",
+    "columns_per_frame",
+    "columns_per_packet",
+    "column_window",
+    "pixel_shift_by_row",
+)
 
 
 def sensor_from_metadata(json_text: str) -> Sensor:
@@ -43,7 +56,7 @@ def parse_metadata(json_text: str) -> core.SensorInfo:
         raise BadMetadata("metadata is malformed: it holds a text, list or nesting that is far too long")
     try:
         info = core.SensorInfo(json.dumps(used, ensure_ascii=False))
-        fault = _fault(info)
+        fault = _fault(info) or _replaced_entry(used, info)
         core.PacketFormat.from_info(info)
     except (RuntimeError, ValueError, TypeError, OverflowError, IndexError, KeyError, MemoryError) as error:
         raise BadMetadata(f"metadata is malformed: {_one_line(error)}") from None
@@ -134,6 +147,20 @@ def _transform_fault(info: core.SensorInfo) -> str | None:
         rigid = rigid and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
         if not rigid or np.linalg.det(rotation) < 0:
             return f"{name} is not a rigid transform"
+    return None
+
+
+def _replaced_entry(document: dict, info: core.SensorInfo) -> str | None:
+    """An entry that is there, but wrong in a way for which the SDK puts its own default in silence."""
+    stated = dict(document)
+    for section in ("beam_intrinsics", "lidar_intrinsics", "data_format", "lidar_data_format"):
+        if isinstance(document.get(section), dict):
+            stated |= document[section]
+    for holder, names in ((info, STATED_GEOMETRY), (info.format, STATED_FORMAT)):
+        for name in names:
+            used = np.ravel(getattr(holder, name))
+            if name in stated and not np.array_equal(np.ravel(stated[name]), used):
+                return f"{name} is {str(stated[name])[:60]}"
     return None
 
 

@@ -35,6 +35,9 @@ def open_source(
         if path.suffix.lower() in FILE_SUFFIXES or "/" in source:
             raise SourceNotFound(f"there is no file {source}")
         return LiveSource(source, meta, stop, timeout_s)
-    if path.suffix.lower() == ".osf":
-        return OsfSource(path, read_metadata(meta).text if meta else None)
-    return PcapSource(path, meta)
+    try:
+        if path.suffix.lower() == ".osf":
+            return OsfSource(path, read_metadata(meta).text if meta else None)
+        return PcapSource(path, meta)
+    except OSError as error:
+        raise SourceNotFound(f"{source} cannot be read: {error.strerror}") from None

@@ -101,6 +101,15 @@ class Survey:
         if not self.datagrams:
             raise BadCapture(f"{self.path} ({self.size} bytes) holds {self.seen()}: record again")
 
+    def require_one_sender(self, verdict: Verdict) -> None:
+        """Raises BadCapture where packets that name no sensor come from several."""
+        if len(verdict.senders) > 1 and not verdict.filter.has_ids:
+            senders = ", ".join(sorted(str(ipaddress.ip_address(sender)) for sender in verdict.senders))
+            raise BadCapture(
+                f"{self.path} holds LEGACY packets of like sensors at {senders}, which cannot be told apart: "
+                "give a capture of one (tcpdump host ADDRESS)"
+            )
+
     def error(self, verdict: Verdict, metadata: str) -> DriverError:
         """Why no packet of the capture fits the metadata of this name."""
         expected, here, seen = verdict.filter, self.path, f"seen {self.seen()}"
