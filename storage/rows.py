@@ -88,7 +88,3 @@ class SceneScans(Trajectory):
     visit_number: np.ndarray  # (N,) int64
     descriptors: np.ndarray  # (N, D) float32, unit
     model_id: np.ndarray  # (N,) str, of the descriptors
-
-    def only(self, keep: np.ndarray) -> SceneScans:
-        """Some of the scans; keep (N,) bool."""
-        return SceneScans(**{name: column[keep] for name, column in vars(self).items()})
