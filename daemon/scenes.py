@@ -9,6 +9,9 @@ import numpy as np
 from .config import SceneConfig
 from .hull import convex_hull, distance_m, grown_area_m2
 
+RETURN_REACH_M = 2.0  # a robot this near to where it was in the same visit ...
+RETURN_PATH_M = 10.0  # ... so much of its path ago has come back: that is another visit
+
 
 @dataclass(eq=False)
 class Scene:
@@ -28,6 +31,21 @@ class Visit:
     t_in_ns: int
     t_out_ns: int
     scan_ids: list[int] = field(default_factory=list)
+    path: list[np.ndarray] = field(default_factory=list)  # position (2,) of each scan, metres, map frame
+
+    def take(self, scan_id: int, stamp_ns: int, xy: np.ndarray) -> None:
+        """One more key scan."""
+        if not self.scan_ids or self.scan_ids[-1] != scan_id:
+            self.scan_ids.append(scan_id)
+            self.path.append(xy)
+            self.t_out_ns = stamp_ns
+
+    def returns_to(self, xy: np.ndarray) -> bool:
+        """Whether a robot now at xy is back where it was earlier in this visit."""
+        path = np.array([*self.path, xy])
+        travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        old = travelled < travelled[-1] - RETURN_PATH_M
+        return bool((np.linalg.norm(path[old] - xy, axis=1) < RETURN_REACH_M).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +83,13 @@ class SceneTracker:
 
     def update(self, scan_id: int, stamp_ns: int, xy: np.ndarray, descriptor: np.ndarray) -> SceneUpdate:
         """Take a key scan at xy (2,) metres in the map, descriptor (256,)."""
-        ended = self._leave_scenes(xy) + self._cut_long_visits(stamp_ns)
+        new_scene = None
+        if self._current is not None and self._is_over(self._current, stamp_ns, xy):
+            new_scene = self._close_current()
+        ended = self._end_visits(stamp_ns, xy)
         inside = self.scenes_near(xy, 0.0)
-        self._stay_in(inside, scan_id, stamp_ns)
-        new_scene = self._grow_current(scan_id, stamp_ns, xy, descriptor, bool(inside))
+        self._stay_in(inside, scan_id, stamp_ns, xy)
+        new_scene = self._grow_current(scan_id, stamp_ns, xy, descriptor, bool(inside)) or new_scene
         return SceneUpdate(new_scene, ended)
 
     def finish(self) -> SceneUpdate:
@@ -90,16 +111,14 @@ class SceneTracker:
         hull = convex_hull(np.vstack([self._hull, xy]))  # line 7
         too_large = grown_area_m2(hull, self._config.margin_m) > self._config.alpha_m2
         spread = np.linalg.norm(np.array(self._descriptors) - descriptor, axis=1).max()
-        too_long = stamp_ns - self._current.t_in_ns > self._config.max_visit_s * 1e9
-        if not (too_large or too_long) and spread <= self._config.beta:  # line 8
+        if not too_large and spread <= self._config.beta:  # line 8
             self._hull = hull  # line 17
             self._descriptors.append(descriptor)
-            self._current.scan_ids.append(scan_id)
-            self._current.t_out_ns = stamp_ns
+            self._current.take(scan_id, stamp_ns, xy)
             return None
         scene = self._close_current()  # line 9
         if distance_m(scene.hull, xy) <= self._config.margin_m:  # lines 11-12
-            self._stay_in([scene], scan_id, stamp_ns)
+            self._stay_in([scene], scan_id, stamp_ns, xy)
         elif not inside:  # line 14
             self._start_current(scan_id, stamp_ns, xy, descriptor)
         return scene
@@ -107,7 +126,7 @@ class SceneTracker:
     def _start_current(self, scan_id: int, stamp_ns: int, xy: np.ndarray, descriptor: np.ndarray) -> None:
         self._hull = convex_hull(xy)
         self._descriptors = [descriptor]
-        self._current = Visit(self._next_scene_id, 1, stamp_ns, stamp_ns, [scan_id])
+        self._current = Visit(self._next_scene_id, 1, stamp_ns, stamp_ns, [scan_id], [xy])
         self._next_scene_id += 1
 
     def _close_current(self) -> Scene:
@@ -125,22 +144,23 @@ class SceneTracker:
 
     # Visits -----------------------------------------------------------------------------------------------------
 
-    def _stay_in(self, inside: list[Scene], scan_id: int, stamp_ns: int) -> None:
+    def _stay_in(self, inside: list[Scene], scan_id: int, stamp_ns: int, xy: np.ndarray) -> None:
         for scene in inside:
             if scene.scene_id not in self._open_visits:
                 scene.n_visits += 1
                 self._open_visits[scene.scene_id] = Visit(scene.scene_id, scene.n_visits, stamp_ns, stamp_ns)
-        for scene_id, visit in self._open_visits.items():
-            if not visit.scan_ids or visit.scan_ids[-1] != scan_id:
-                visit.scan_ids.append(scan_id)
-                visit.t_out_ns = stamp_ns
+        for visit in self._open_visits.values():
+            visit.take(scan_id, stamp_ns, xy)
 
-    def _leave_scenes(self, xy: np.ndarray) -> list[Visit]:
+    def _end_visits(self, stamp_ns: int, xy: np.ndarray) -> list[Visit]:
         reach = self._config.margin_m + self._config.exit_margin_m
-        left = [i for i in self._open_visits if distance_m(self._scenes[i].hull, xy) > reach]
-        return [self._open_visits.pop(i) for i in left]
+        over = [
+            scene_id
+            for scene_id, visit in self._open_visits.items()
+            if distance_m(self._scenes[scene_id].hull, xy) > reach or self._is_over(visit, stamp_ns, xy)
+        ]
+        return [self._open_visits.pop(scene_id) for scene_id in over]
 
-    def _cut_long_visits(self, stamp_ns: int) -> list[Visit]:
-        limit_ns = self._config.max_visit_s * 1e9
-        long = [i for i, visit in self._open_visits.items() if stamp_ns - visit.t_in_ns > limit_ns]
-        return [self._open_visits.pop(i) for i in long]
+    def _is_over(self, visit: Visit, stamp_ns: int, xy: np.ndarray) -> bool:
+        """Visits that last, or in which the robot comes back on its path, are cut: results come while it is there."""
+        return stamp_ns - visit.t_in_ns > self._config.max_visit_s * 1e9 or visit.returns_to(xy)

@@ -116,3 +116,17 @@ def test_a_point_inside_the_hull_is_at_no_distance():
     assert len(square) == 4
     assert distance_m(square, np.array([1.0, 3.0])) == 0.0
     assert distance_m(square, np.array([7.0, 8.0])) == pytest.approx(5.0)
+
+
+def test_turning_back_within_a_scene_begins_another_visit():
+    walk = Walk().to((0, 0), (14, 0), (0, 1)).finish()
+    assert len(walk.scenes) == 1
+    assert [visit.number for visit in walk.ended] == [1, 2]
+    assert len(walk.ended[1].scan_ids) > 10
+
+
+def test_each_lap_around_a_lawn_smaller_than_a_scene_is_a_visit():
+    lap = [(0, 0), (3, 0), (3, 4), (0, 4), (0, 0)]
+    walk = Walk().to(*lap).to(*lap).to(*lap).finish()
+    assert len(walk.scenes) == 1
+    assert max(visit.number for visit in walk.ended) >= 3
