@@ -29,13 +29,13 @@ def open_source(
     Raises SourceNotFound, BadMetadata, BadCapture or SensorUnavailable.
     """
     path = Path(source)
-    if path.is_dir():
-        raise SourceNotFound(f"{source} is a folder: give a pcap or OSF file, or a sensor's address")
-    if not path.exists():
-        if path.suffix.lower() in FILE_SUFFIXES or "/" in source:
-            raise SourceNotFound(f"there is no file {source}")
-        return LiveSource(source, meta, stop, timeout_s)
     try:
+        if path.is_dir():
+            raise SourceNotFound(f"{path} is a folder: give a pcap or OSF file, or a sensor's address")
+        if not path.exists():
+            if path.suffix.lower() in FILE_SUFFIXES or "/" in source:
+                raise SourceNotFound(f"there is no file {source}")
+            return LiveSource(source, meta, stop, timeout_s)
         if path.suffix.lower() == ".osf":
             return OsfSource(path, read_metadata(meta).text if meta else None)
         return PcapSource(path, meta)

@@ -7,6 +7,7 @@ import json
 import socket
 import threading
 import time
+from http.client import HTTPException
 from ipaddress import ip_address
 from urllib.error import HTTPError, URLError
 from urllib.request import ProxyHandler, Request, build_opener
@@ -51,7 +52,7 @@ class SensorHttp:
             raise SensorUnavailable(
                 f"{url} answers {error.code} {error.reason}: no Ouster sensor, or firmware before 3.1"
             ) from None
-        except (URLError, OSError) as error:
+        except (URLError, OSError, HTTPException, ValueError) as error:
             reason = getattr(error, "reason", error)
             raise SensorUnavailable(
                 f"no sensor answers at http://{self.address} ({reason}): check its power, cable and address"
@@ -67,17 +68,19 @@ def prepare_sensor(sensor: SensorHttp, stop: threading.Event) -> dict:
 
     Raises SensorUnavailable where it does not answer or does not get ready; also when stopped.
     """
+    our_address = local_address(sensor.address)
     metadata = sensor.metadata()
-    changes = _changes(metadata["config_params"], local_address(sensor.address))
+    changes = _changes(metadata["config_params"], our_address)
     if changes:
         sensor.configure(changes)
+        stop.wait(POLL_S)  # for a moment it still tells the state before
         metadata = sensor.metadata()
     deadline = time.monotonic() + READY_TIMEOUT_S
     while (status := metadata["sensor_info"].get("status")) != "RUNNING":
         if status == "ERROR" or time.monotonic() > deadline or stop.wait(POLL_S):
             raise SensorUnavailable(f"sensor {sensor.address} does not run: its status is {status}")
         metadata = sensor.metadata()
-    left = _changes(metadata["config_params"], local_address(sensor.address))
+    left = _changes(metadata["config_params"], our_address)
     if left:
         raise SensorUnavailable(f"sensor {sensor.address} does not take {left}")
     return metadata
@@ -91,8 +94,9 @@ def local_address(address: str) -> str:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect(target)  # sends nothing
             return probe.getsockname()[0]
-    except OSError as error:
-        raise SensorUnavailable(f"there is no file and no sensor {host} ({error.strerror})") from None
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a name"
+        raise SensorUnavailable(f"there is no file and no sensor {host} ({reason})") from None
 
 
 def host_of(address: str) -> str:

@@ -1,0 +1,209 @@
+"""A sensor on the network: asked, set to send here, read; and what is said when it does not answer."""
+
+import json
+import socket
+import threading
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import islice
+
+import numpy as np
+import pytest
+from captures import COLUMNS, INIT_ID, metadata, packets, ranges_mm
+from revisitd.drivers.errors import BadMetadata, SensorUnavailable
+from revisitd.drivers.losses import Loss
+from revisitd.drivers.ouster import open_source
+
+METADATA = "/api/v1/sensor/metadata"
+
+
+class FakeSensor:
+    """Answers HTTP as a sensor does, and sends UDP packets from the same address."""
+
+    def __init__(self, document: dict):
+        self.document = document
+        self.requests: list[tuple[str, str]] = []
+        self.set: list[dict] = []
+        self.accepts = True
+        fake = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self):
+                fake.requests.append(("GET", self.path))
+                fake.answer(self, fake.document if self.path == METADATA else None)
+
+            def do_POST(self):
+                fake.requests.append(("POST", self.path))
+                fake.set.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+                if fake.accepts:
+                    fake.document["config_params"] |= fake.set[-1]
+                fake.document["sensor_info"]["status"] = "RUNNING"
+                fake.answer(self, {})
+
+            def log_message(self, *_):
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.address = f"127.0.0.1:{self.server.server_port}"
+        self.thread = threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True)
+        self.thread.start()
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+
+    def answer(self, handler: BaseHTTPRequestHandler, document: dict | None) -> None:
+        handler.send_response(404 if document is None else 200)
+        handler.end_headers()
+        handler.wfile.write(json.dumps(document).encode())
+
+    def send(self, payloads: list[bytes]) -> None:
+        port = self.document["config_params"]["udp_port_lidar"]
+        for payload in payloads:
+            self.socket.sendto(payload, ("127.0.0.1", port))
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.thread.join()
+        self.server.server_close()
+        self.socket.close()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def fake_sensor(profile: str = "RNG19_RFL8_SIG16_NIR16", **changes):
+    fake = FakeSensor(metadata(profile, config_params__udp_port_lidar=free_port(), **changes))
+    try:
+        yield fake
+    finally:
+        fake.close()
+
+
+def test_frames_are_those_that_were_sent():
+    with fake_sensor() as fake, open_source(fake.address, timeout_s=5) as source:
+        fake.send(packets(fake.document, range(3)))
+        frames = list(islice(source, 3))
+        assert source.sensor.init_id == INIT_ID and source.n_frames_estimate is None
+    assert fake.requests == [("GET", METADATA)]  # it was running and sending here: nothing was set
+    for index, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.range_mm, ranges_mm(index))
+        assert frame.valid_ratio == 1 and frame.host_ns > 0
+
+
+def test_a_sensor_that_idles_and_sends_elsewhere_is_set_up_without_persisting():
+    with fake_sensor(config_params__operating_mode="STANDBY", config_params__udp_dest="10.5.5.77") as fake:
+        fake.document["sensor_info"]["status"] = "STANDBY"
+        open_source(fake.address).close()
+        assert fake.set == [{"operating_mode": "NORMAL", "udp_dest": "127.0.0.1"}]
+        assert ("POST", "/api/v1/sensor/config?reinit=true&persist=false") in fake.requests
+
+
+def test_a_sensor_that_sends_to_everyone_is_left_alone():
+    with fake_sensor(config_params__udp_dest="239.201.201.201") as fake:
+        open_source(fake.address).close()
+        assert not fake.set
+
+
+def test_a_sensor_that_does_not_take_the_settings_is_an_error():
+    with fake_sensor(config_params__udp_dest="10.5.5.77") as fake:
+        fake.accepts = False
+        with pytest.raises(SensorUnavailable, match="does not take"):
+            open_source(fake.address)
+
+
+def test_a_sensor_in_error_is_an_error():
+    with fake_sensor() as fake:
+        fake.document["sensor_info"]["status"] = "ERROR"
+        with pytest.raises(SensorUnavailable, match="status is ERROR"):
+            open_source(fake.address)
+
+
+def test_waiting_for_a_sensor_that_warms_up_ends_when_stopped():
+    stop = threading.Event()
+    stop.set()
+    with fake_sensor() as fake:
+        fake.document["sensor_info"]["status"] = "WARMUP"
+        with pytest.raises(SensorUnavailable, match="status is WARMUP"):
+            open_source(fake.address, stop=stop)
+
+
+def test_with_metadata_given_nothing_is_asked_and_nothing_set(tmp_path):
+    with fake_sensor(config_params__udp_dest="10.5.5.77") as fake:
+        meta = tmp_path / "sensor.json"
+        meta.write_text(json.dumps(fake.document))
+        with open_source("127.0.0.1", meta, timeout_s=5) as source:
+            fake.send(packets(fake.document, range(1)))
+            assert next(iter(source)).valid_ratio == 1
+        assert not fake.requests
+
+
+def test_silence_is_told_after_the_time_given():
+    with fake_sensor() as fake, open_source(fake.address, timeout_s=0.1) as source:
+        with pytest.raises(SensorUnavailable, match=r"sent nothing to UDP port \d+ for 0.1 s"):
+            next(iter(source))
+
+
+def test_a_silent_sensor_can_be_stopped():
+    stop = threading.Event()
+    with fake_sensor() as fake, open_source(fake.address, stop=stop) as source:
+        threading.Timer(0.05, stop.set).start()
+        assert list(source) == []
+
+
+def test_a_restarted_sensor_ends_the_iteration():
+    with fake_sensor() as fake, open_source(fake.address, timeout_s=5) as source:
+        sent = packets(fake.document, range(1))
+        fake.document["sensor_info"]["initialization_id"] += 1
+        fake.send(sent + packets(fake.document, range(1, 4)))
+        frames = []
+        with pytest.raises(SensorUnavailable, match="restarted"):
+            frames.extend(source)
+        assert source.losses[Loss.OTHER_INIT_ID] == 64
+
+
+def test_lost_packets_are_seen_in_the_frame():
+    with fake_sensor() as fake, open_source(fake.address, timeout_s=5) as source:
+        sent = packets(fake.document, range(2))
+        del sent[5]
+        fake.send(sent)
+        frames = iter(source)
+        assert next(frames).valid_ratio == 1 - 16 / COLUMNS
+        assert next(frames).valid_ratio == 1
+
+
+def test_a_port_that_is_taken_is_named():
+    with fake_sensor() as fake, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("0.0.0.0", fake.document["config_params"]["udp_port_lidar"]))
+        with pytest.raises(SensorUnavailable, match=r"cannot listen at UDP port \d+ .* another program"):
+            open_source(fake.address)
+
+
+def test_a_machine_without_a_sensor_is_an_error():
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+    with pytest.raises(SensorUnavailable, match="no sensor answers at http://127.0.0.1.*refused"):
+        open_source(address)
+
+
+def test_a_web_server_that_is_no_sensor_is_an_error():
+    with fake_sensor() as fake:
+        fake.document = {"hello": "world"}
+        with pytest.raises(SensorUnavailable, match="is not a sensor's metadata"):
+            open_source(fake.address)
+        fake.document = None
+        with pytest.raises(SensorUnavailable, match="answers 404"):
+            open_source(fake.address)
+
+
+def test_a_name_that_is_neither_file_nor_sensor_is_an_error():
+    with pytest.raises(SensorUnavailable, match="no file and no sensor nowhere.invalid"):
+        open_source("nowhere.invalid")
+
+
+def test_a_sensor_with_its_lidar_off_is_an_error():
+    with fake_sensor("OFF") as fake, pytest.raises(BadMetadata, match="switched off"):
+        open_source(fake.address)
