@@ -17,6 +17,7 @@ VLAN_TAGS = (b"\x81\x00", b"\x88\xa8")
 FRAMED = {1: (12, 14), 113: (14, 16), 276: (0, 20)}
 # Link type -> where the IP header lies: BSD loopback, then bare IP.
 BARE = {0: 4, 108: 4, 12: 0, 101: 0, 228: 0, 229: 0}
+IPV4 = struct.Struct(">BxHHHxBxx8s")  # version and length, total, identity, flags, protocol, addresses
 
 
 class Datagram(NamedTuple):
@@ -37,8 +38,7 @@ class Reassembler:
 
     def datagrams(self, records: Iterable[Record]) -> Iterator[Datagram]:
         for record in records:
-            datagram = self._datagram(record)
-            if datagram:
+            if datagram := self._datagram(record):
                 yield datagram
         for _ in self._pending:
             self._lose(Loss.LOST_FRAGMENT)
@@ -46,25 +46,24 @@ class Reassembler:
 
     def _datagram(self, record: Record) -> Datagram | None:
         """The datagram that this record completes, if it does."""
-        if not record.whole:
+        time_ns, link_type, data, whole = record
+        if not whole:
             return self._lose(Loss.CUT_RECORD)
-        data, start = record.data, _ip_start(record.data, record.link_type)
+        start = _ip_start(data, link_type)
         version = data[start] >> 4 if 0 <= start < len(data) else 0
         if version == 4 and len(data) >= start + 20:
-            return self._ipv4(record.time_ns, data, start)
+            return self._ipv4(time_ns, data, start)
         if version == 6 and len(data) >= start + 48:
-            return self._ipv6(record.time_ns, data, start)
+            return self._ipv6(time_ns, data, start)
         return self._lose(Loss.NOT_UDP)
 
     def _ipv4(self, time_ns: int, data: bytes, start: int) -> Datagram | None:
-        if data[start + 9] != UDP:
+        first, total, identity, flags, protocol, addresses = IPV4.unpack_from(data, start)
+        if protocol != UDP:
             return self._lose(Loss.NOT_UDP)
-        total, identity, flags = struct.unpack_from(">HHH", data, start + 2)
-        body = start + 4 * (data[start] & 15)
         end = start + total if total else len(data)  # 0 where the network card was left to split the packet
-        addresses = data[start + 12 : start + 20]
-        part, offset, more = data[body:end], 8 * (flags & 0x1FFF), bool(flags & 0x2000)
-        return self._place(time_ns, addresses, identity, part, offset, more)
+        part = data[start + 4 * (first & 15) : end]
+        return self._place(time_ns, addresses, identity, part, 8 * (flags & 0x1FFF), bool(flags & 0x2000))
 
     def _ipv6(self, time_ns: int, data: bytes, start: int) -> Datagram | None:
         length, following = struct.unpack_from(">HB", data, start + 4)
@@ -84,20 +83,28 @@ class Reassembler:
             return self._udp(time_ns, addresses, part)
         key = (addresses, identity)
         fragments = self._pending.get(key)
-        if fragments and offset in fragments.parts:  # the 16-bit identity came round again
+        if fragments is None or offset in fragments.parts:
+            self._begin(key, fragments)
+            fragments = self._pending[key]
+        fragments.parts[offset] = part
+        fragments.received += len(part)
+        if not more:
+            fragments.total = offset + len(part)
+        if fragments.received != fragments.total:
+            return None
+        del self._pending[key]
+        whole = b"".join(fragments.parts[at] for at in sorted(fragments.parts))
+        return self._udp(time_ns, addresses, whole)
+
+    def _begin(self, key: tuple, same: "_Fragments | None") -> None:
+        """Makes room for a datagram; `same` has its identity, which has 16 bits and so comes round."""
+        if same:
             del self._pending[key]
             self._lose(Loss.LOST_FRAGMENT)
-            fragments = None
-        if not fragments:
-            fragments = self._pending[key] = _Fragments()
-        fragments.add(part, offset, more)
-        if fragments.complete():
-            del self._pending[key]
-            return self._udp(time_ns, addresses, fragments.join())
-        if len(self._pending) > MAX_PENDING:
+        elif len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
             self._lose(Loss.LOST_FRAGMENT)
-        return None
+        self._pending[key] = _Fragments()
 
     def _udp(self, time_ns: int, addresses: bytes, data: bytes) -> Datagram | None:
         source_port, port, length = struct.unpack_from(">HHH", data) if len(data) >= 8 else (0, 0, 8)
@@ -120,21 +127,11 @@ class _Fragments:
         self.received = 0
         self.total = -1
 
-    def add(self, part: bytes, offset: int, more: bool) -> None:
-        self.parts[offset] = part
-        self.received += len(part)
-        if not more:
-            self.total = offset + len(part)
-
-    def complete(self) -> bool:
-        return self.received == self.total
-
-    def join(self) -> bytes:
-        return b"".join(self.parts[offset] for offset in sorted(self.parts))
-
 
 def _ip_start(data: bytes, link_type: int) -> int:
     """Offset of the IP header in a record, -1 where there is none."""
+    if link_type == 1 and data[12:14] in ETHERTYPES:
+        return 14
     if link_type not in FRAMED:
         return BARE.get(link_type, -1)
     at, start = FRAMED[link_type]

@@ -17,6 +17,7 @@ from .packets import FIELDS
 from .source import Source
 
 MAX_BLOCK_BYTES = 64 << 20
+WRONG_CHECKSUM = "has a wrong checksum"
 METADATA_OFFSET_ENTRY = 4 + 2 * 2  # in the header's vtable: its third field
 
 
@@ -114,10 +115,18 @@ def _fault(path: Path) -> str | None:
         field_at = struct.unpack_from("<H", header, vtable + METADATA_OFFSET_ENTRY)[0]
         offset = struct.unpack_from("<Q", header, table + field_at)[0]
         if offset >= path.stat().st_size:
-            return None  # a cut file: the SDK finds the chunks that are whole
+            return _chunk_fault(file)
         file.seek(offset)
         _, fault = _block(file)
         return f"its metadata {fault}" if fault else None
+
+
+def _chunk_fault(file: BinaryIO) -> str | None:
+    """In a file whose end with the metadata is missing: there the SDK does not check the chunks either."""
+    fault = None
+    while not fault:
+        _, fault = _block(file)
+    return f"its end is missing, and what is left {fault}" if fault == WRONG_CHECKSUM else None
 
 
 def _block(file: BinaryIO) -> tuple[bytes, str | None]:
@@ -132,5 +141,5 @@ def _block(file: BinaryIO) -> tuple[bytes, str | None]:
     if len(checksum) < 4:
         return body, "is not complete"
     if int.from_bytes(checksum, "little") != zlib.crc32(prefix + body):
-        return body, "has a wrong checksum"
+        return body, WRONG_CHECKSUM
     return body, None

@@ -12,7 +12,7 @@ from .losses import Loss
 from .packets import PacketFilter
 from .pcap import PcapFile, Record
 
-ENOUGH = 2000  # datagrams, about one second: then a sensor that is there has been seen
+ENOUGH = 500  # datagrams, half a second: by then a sensor that is there has been seen
 MOST = 20_000
 SHOWN = 4
 LEGACY_SIZES = (3392, 6464, 12608, 24896)  # 16, 32, 64, 128 beams

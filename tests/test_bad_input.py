@@ -290,3 +290,7 @@ def test_an_osf_recording_with_a_damaged_byte_or_a_missing_end_is_an_error(share
         assert_complaint(complaint(path), BadCapture, "walk.osf")
     path.write_bytes(whole[:300_000])
     assert_complaint(complaint(path), BadCapture, "holds no frames", "it was cut")
+    cut = bytearray(whole[:300_000])
+    cut[500] ^= 0xFF
+    path.write_bytes(cut)
+    assert_complaint(complaint(path), BadCapture, "its end is missing", "wrong checksum")
