@@ -60,7 +60,7 @@ def _match_named(capture: Path, path: Path) -> tuple[Metadata, Survey, Verdict]:
     survey = Survey(capture, [PacketFilter(metadata.info)] if metadata else [])
     survey.require_packets()  # an empty capture is the plainer truth
     if fault:
-        raise fault
+        raise type(fault)(f"{fault}; {capture} holds {survey.seen()}")
     verdict = survey.verdicts[0]
     if not verdict.fits:
         raise survey.error(verdict, path.name)

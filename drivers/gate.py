@@ -39,11 +39,10 @@ class FrameGate:
         self.columns_missing = 0  # in frames of which some did
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Everything that was counted, by name."""
-        counted = {"accepted": self.accepted, "frames missing": self.frames_missing}
-        counted |= {"columns missing": self.columns_missing}
-        return counted | {str(reason): count for reason, count in self.rejected.items()}
+    def losses(self) -> dict[str, int]:
+        """What was lost, by cause."""
+        missing = {"frames missing": self.frames_missing, "columns missing": self.columns_missing}
+        return missing | {f"frames rejected: {reason}": count for reason, count in self.rejected.items()}
 
     def check(self, frame: Frame) -> Rejection | None:
         """None where the frame is good, else why it is not. Call once for each frame, in order."""

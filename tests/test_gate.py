@@ -32,7 +32,7 @@ def frame(index: int, n_lost: int = 0) -> Frame:
 def test_whole_frames_pass():
     gate = FrameGate()
     assert [gate.check(frame(index)) for index in range(3)] == [None] * 3
-    assert gate.counts == {"accepted": 3, "frames missing": 0, "columns missing": 0}
+    assert gate.accepted == 3 and not any(gate.losses.values())
 
 
 def test_a_frame_with_too_few_columns_is_rejected_and_its_columns_are_counted():
@@ -40,7 +40,7 @@ def test_a_frame_with_too_few_columns_is_rejected_and_its_columns_are_counted():
     assert gate.check(frame(0, n_lost=52)) is Rejection.TOO_FEW_COLUMNS
     assert gate.check(frame(1, n_lost=51)) is None
     assert gate.columns_missing == 103
-    assert gate.counts["too few columns"] == 1
+    assert gate.losses["frames rejected: too few columns"] == 1
 
 
 def test_only_columns_of_the_azimuth_window_are_expected():
