@@ -43,10 +43,9 @@ class _Group(click.Group):
 
 
 def _exit_codes():
-    from .replay import NothingUsable
-    from ..models.descriptor import ModelError
+    from ..models.descriptor import ModelError  # onnxruntime: not for every command
 
-    return ((NothingUsable, 65), (ModelError, 78), *EXIT_CODES)
+    return ((ModelError, 78), *EXIT_CODES)
 
 
 DATA = click.option(
@@ -198,7 +197,7 @@ def _virtual():
 def _list(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
     if wanted and not ctx.resilient_parsing:
         for name, scenario in _virtual().SCENARIOS.items():
-            click.echo(f"{name:10s} {scenario.description}")
+            click.echo(f"{name:10s} {scenario.about}")
         ctx.exit()
 
 

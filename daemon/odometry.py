@@ -95,11 +95,11 @@ class Odometry:
         return points, np.broadcast_to(phase, valid.shape)[valid]
 
     def _strides(self, shape: tuple[int, int]) -> tuple[int, int]:
-        excess = shape[0] * shape[1] / self._config.max_points
-        # Columns are denser than rows on every OS1 but the 128-beam at 512 columns: thin them first.
-        cols = max(1, int(np.ceil(np.sqrt(excess))))
-        rows = max(1, int(np.ceil(excess / cols)))
-        return rows, cols
+        """Strides of rows and columns that leave at most max_points; columns, the denser ones, are thinned first."""
+        strides = [1, 1]
+        while shape[0] * shape[1] > self._config.max_points * strides[0] * strides[1]:
+            strides[0 if strides[0] < strides[1] else 1] += 1
+        return strides[0], strides[1]
 
     def _gap_frames(self, frame: Frame) -> float:
         if self._stamp_ns is None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..drivers.frame import Frame
-from ..drivers.gate import FrameGate
 from ..drivers.ouster import Source, open_source
 from ..models.descriptor import DescriptorModel
 from ..storage.store import Store
@@ -32,10 +31,6 @@ class Summary:
     seconds: float
 
 
-class NothingUsable(Exception):
-    """The source ended without a frame that could be used; the message says why."""
-
-
 Progress = Callable[[Counts, int, int | None], None]  # counts, changes, frames expected; called for each frame
 
 
@@ -44,7 +39,7 @@ def replay(
 ) -> Summary:
     """Run a source to its end. rate None: as fast as it goes, nothing is dropped; else a multiple of real time.
 
-    Raises DriverError for a source that cannot be read, NothingUsable, and the storage's errors.
+    Raises DriverError for a source that cannot be read or that held no usable frame, and the storage's errors.
     """
     start = time.perf_counter()
     with open_source(source, meta) as frames, Store.open_writer(data) as store:
@@ -62,12 +57,10 @@ def replay(
         finally:
             worker.close()
         progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
-        losses = {**frames.losses, **pipeline.gate.counts}
-        if pipeline.counts.frames == pipeline.counts.rejected:
-            raise NothingUsable(_why_nothing(source, pipeline.counts, pipeline.gate))
+        pipeline.gate.require_accepted(source)
         return Summary(
             pipeline.counts,
-            {cause: count for cause, count in losses.items() if count},
+            {str(cause): count for cause, count in {**frames.losses, **pipeline.gate.losses}.items() if count},
             worker.done,
             worker.failed,
             worker.dropped,
@@ -86,7 +79,3 @@ def _paced(frames: Source, rate: float | None):
             time.sleep(max(0.0, due - time.monotonic()))
         yield frame
 
-
-def _why_nothing(source: str, counts: Counts, gate: FrameGate) -> str:
-    causes = ", ".join(f"{count} x {cause}" for cause, count in gate.counts.items() if count)
-    return f"{source}: none of its {counts.frames} frames could be used ({causes})"
