@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-
-from revisitd.models.preprocess import INPUT_SHAPE, N_COLUMNS, Resampler, row_elevation_rad
-
 import yard
+from revisitd.models.preprocess import INPUT_SHAPE, N_COLUMNS, Resampler, row_elevation_rad
 
 
 def resampled(count, columns, **kwargs):

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-
-from revisitd.models.overlap import RangeView, overlap, overlap_matrix, view_of_scan
-
 import yard
+from revisitd.models.overlap import RangeView, overlap, overlap_matrix, view_of_scan
 
 
 def view(x, y, yaw=0.0, count=64, columns=512, **kwargs):
@@ -65,9 +63,9 @@ def test_an_empty_scan_overlaps_nothing():
 
 def test_the_matrix_holds_the_overlap_of_each_pair():
     views, poses = zip(view(2, -1), view(-6, 3, yaw=2.0), view(8, 8), strict=True)
-    matrix = overlap_matrix(list(views), np.stack(poses))
+    matrix = overlap_matrix(list(views), np.stack(poses), 100_000)
     assert np.array_equal(matrix, matrix.T) and np.all(np.diag(matrix) == 1)
-    assert matrix[0, 2] == pytest.approx(overlap(views[0], views[2], poses[0], poses[2]), abs=1e-6)
+    assert matrix[0, 2] == pytest.approx(overlap(views[0], views[2], poses[0], poses[2]), abs=1e-2)
 
 
 def test_fewer_points_give_nearly_the_same_overlap():

@@ -11,22 +11,32 @@ def beams(count: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     return np.tile(np.array([24, 16, 8, 0]) * columns // 1024, count // 4), altitude
 
 
-def scan(count: int = 64, columns: int = 512, x: float = 2.0, y: float = -1.0, yaw: float = 0.0,
-         hidden: tuple[float, float] | None = None) -> np.ndarray:
-    """(count, columns) uint32 mm, staggered: the yard from (x, y) facing yaw; `hidden`: azimuths without return."""
+def scan(
+    count: int = 64,
+    columns: int = 512,
+    x: float = 2.0,
+    y: float = -1.0,
+    yaw: float = 0.0,
+    hidden: tuple[float, float] | None = None,
+) -> np.ndarray:
+    """(count, columns) uint32 mm, staggered: the yard from (x, y) facing yaw; azimuths `hidden` are empty."""
     shift, altitude = beams(count, columns)
     aligned = (np.arange(columns)[None, :] + shift[:, None]) % columns
     azimuth = -aligned * (2 * np.pi / columns) + yaw + 1e-4  # no beam runs along a wall
     ahead, left = np.cos(azimuth), np.sin(azimuth)
-    flat = np.minimum(np.where(ahead > 0, HALF_X_M - x, -HALF_X_M - x) / ahead,
-                      np.where(left > 0, HALF_Y_M - y, -HALF_Y_M - y) / left)
+    flat = np.minimum(
+        np.where(ahead > 0, HALF_X_M - x, -HALF_X_M - x) / ahead,
+        np.where(left > 0, HALF_Y_M - y, -HALF_Y_M - y) / left,
+    )
     rise = flat * np.tan(altitude)[:, None]
     ranges = flat / np.cos(altitude)[:, None]
     on_ground = rise < -SENSOR_HEIGHT_M
     ranges = np.where(on_ground, SENSOR_HEIGHT_M / np.sin(np.maximum(-altitude, 1e-3))[:, None], ranges)
     ranges = np.where(rise > WALL_M - SENSOR_HEIGHT_M, 0.0, ranges)
     if hidden is not None:
-        ranges = np.where((np.mod(azimuth, 2 * np.pi) >= hidden[0]) & (np.mod(azimuth, 2 * np.pi) < hidden[1]), 0.0, ranges)
+        ranges = np.where(
+            (np.mod(azimuth, 2 * np.pi) >= hidden[0]) & (np.mod(azimuth, 2 * np.pi) < hidden[1]), 0.0, ranges
+        )
     return np.rint(ranges * 1e3).astype(np.uint32)
 
 
