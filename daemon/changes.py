@@ -30,6 +30,30 @@ class Finding:
     config_digest: str
 
 
+@dataclass(frozen=True, eq=False)
+class Erasure:
+    """A removed object: points (N, 3) that older scans still show, and since when it is gone."""
+
+    points: np.ndarray
+    session: int
+    gone_ns: int
+
+
+def standing(points: np.ndarray, taken: np.ndarray, erasures: list[Erasure]) -> np.ndarray:
+    """Which points (N, 3) of scans taken (N, 2: session, sensor time) are not of a removed object.
+
+    What an object left in scans taken before it was gone is erased; scans taken after it came back stay.
+    """
+    stands = np.ones(len(points), dtype=bool)
+    for gone in erasures:
+        lower, upper = gone.points.min(axis=0) - ERASE_M, gone.points.max(axis=0) + ERASE_M
+        inside = ((points > lower) & (points < upper)).all(axis=1)
+        near = np.flatnonzero(inside & _before(taken, (gone.session, gone.gone_ns)))
+        distance, _ = cKDTree(gone.points).query(points[near], distance_upper_bound=ERASE_M)
+        stands[near[np.isfinite(distance)]] = False
+    return stands
+
+
 class ChangeManager:
     """Adds what a detection found to the store, and answers planners."""
 
@@ -66,21 +90,21 @@ class ChangeManager:
     ) -> np.ndarray:
         """Which points (N, 3) float32 of older scans still stand, by all that was known to be gone at a time.
 
-        taken (N, 2) int64: session and sensor time of each point's scan; until: session and sensor time. What a
-        removed object left in scans taken before it was gone is erased; scans taken after it came back stay.
+        taken (N, 2) int64: session and sensor time of each point's scan; until: session and sensor time. Only
+        what disappeared matters: what appeared is in the scans taken since.
         """
-        stands = np.ones(len(points), dtype=bool)
-        if len(points) == 0:
-            return stands
-        box = points.min(axis=0) - ERASE_M, points.max(axis=0) + ERASE_M
-        for gone in self._store.changes(polarity="disappeared", map_id=map_id, box=box, before=until):
-            near = np.flatnonzero(
-                ((points > gone.box_min - ERASE_M) & (points < gone.box_max + ERASE_M)).all(axis=1)
-                & _before(taken, (gone.session, gone.first_seen_ns))
-            )
-            distance, _ = cKDTree(gone.points).query(points[near], distance_upper_bound=ERASE_M)
-            stands[near[np.isfinite(distance)]] = False
-        return stands
+        box = points.min(axis=0), points.max(axis=0)
+        return standing(points, taken, self.erasures(map_id, box, until))
+
+    def erasures(
+        self, map_id: int, box: tuple[np.ndarray, np.ndarray], until: tuple[int, int]
+    ) -> list[Erasure]:
+        """Removed objects in a box (lower and upper corner (3,), metres, map frame), first seen gone before a time."""
+        lower, upper = box
+        gone = self._store.changes(
+            polarity="disappeared", map_id=map_id, box=(lower - ERASE_M, upper + ERASE_M), before=until
+        )
+        return [Erasure(change.points, change.session, change.first_seen_ns) for change in gone]
 
     def _touching(self, points: np.ndarray, map_id: int) -> list[ChangeObject]:
         """Changes that hold (nothing undid them) and share their place with the points."""

@@ -44,11 +44,11 @@ def replay(
     start = time.perf_counter()
     with open_source(source, meta) as frames, Store.open_writer(data) as store:
         (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
-        sensors = Sensors(store.dir)
-        detection = ChangeDetection(config, store, sensors)
+        model = DescriptorModel.load()
+        detection = ChangeDetection(config, store, model.model_id)
         worker = DetectionWorker(detection.run, config.worker.queue_size)
         try:
-            pipeline = Pipeline(config, store, sensors, DescriptorModel.load(), worker, source, wait=rate is None)
+            pipeline = Pipeline(config, store, Sensors(store.dir), model, worker, source, wait=rate is None)
             for frame in _paced(frames, rate):
                 pipeline.process(frame)
                 progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
@@ -56,6 +56,7 @@ def replay(
             worker.drain()
         finally:
             worker.close()
+            detection.close()
         progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
         pipeline.gate.require_accepted(source)
         return Summary(

@@ -1,0 +1,76 @@
+"""Runs comparisons in a child process, one at a time, and survives its death."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from .comparison import Comparer, Comparison, Job
+
+logger = logging.getLogger(__name__)
+
+NICENESS = 5  # the frame loop goes first on two cores
+
+
+class ComparisonFailed(Exception):
+    """The child could not compare, or died; the message says why."""
+
+
+class DetectionProcess:
+    """A child that compares. Used by one thread; started at once, so that its imports are done when a job comes."""
+
+    def __init__(self, data: Path):
+        self._data = data
+        self._start()
+
+    def compare(self, job: Job) -> Comparison:
+        """Run a job and wait for it, without holding the interpreter's lock. Raises ComparisonFailed."""
+        try:
+            self._connection.send(job)
+            result = self._connection.recv()
+        except (EOFError, OSError) as error:
+            self._process.join(1.0)
+            code = self._process.exitcode
+            self._start()
+            raise ComparisonFailed(f"the detection process died (exit code {code}); another was started") from error
+        if isinstance(result, Exception):
+            raise ComparisonFailed(f"{type(result).__name__}: {result}") from result
+        return result
+
+    def close(self) -> None:
+        """End the child."""
+        self._connection.close()
+        self._process.join()
+
+    def _start(self) -> None:
+        # spawn: a forked copy of a process with threads may hang on a lock that one of them held.
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, self._data), name="revisitd-detection", daemon=True
+        )
+        self._process.start()
+        theirs.close()  # the child alone holds its end: when either dies the other sees the end of the pipe
+        logger.debug("detection process pid=%d", self._process.pid)
+
+
+def _serve(connection: Connection, data: Path) -> None:
+    """The child: answers jobs until the parent closes the pipe or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us in order
+    os.nice(NICENESS)
+    comparer: Comparer | None = None
+    while True:
+        try:
+            job = connection.recv()
+        except EOFError:
+            return
+        try:
+            comparer = comparer or Comparer(data)
+            answer = comparer.compare(job)
+        except Exception as error:  # whatever went wrong is the parent's to judge
+            answer = error
+        connection.send(answer)
