@@ -33,19 +33,41 @@ class Visit:
     scan_ids: list[int] = field(default_factory=list)
     path: list[np.ndarray] = field(default_factory=list)  # position (2,) of each scan, metres, map frame
 
+    stamps_ns: list[int] = field(default_factory=list)
+
     def take(self, scan_id: int, stamp_ns: int, xy: np.ndarray) -> None:
         """One more key scan."""
         if not self.scan_ids or self.scan_ids[-1] != scan_id:
             self.scan_ids.append(scan_id)
             self.path.append(xy)
+            self.stamps_ns.append(stamp_ns)
             self.t_out_ns = stamp_ns
 
     def returns_to(self, xy: np.ndarray) -> bool:
         """Whether a robot now at xy is back where it was earlier in this visit."""
+        return self._turning_point(xy) is not None
+
+    def split_off_return(self, xy: np.ndarray) -> Visit | None:
+        """Give the scans since the robot turned back to a new visit; None where it did not come back."""
+        turn = self._turning_point(xy)
+        if turn is None:
+            return None
+        rest = Visit(self.scene_id, self.number + 1, self.stamps_ns[turn], self.t_out_ns)
+        for name in ("scan_ids", "path", "stamps_ns"):
+            setattr(rest, name, getattr(self, name)[turn:])
+            setattr(self, name, getattr(self, name)[:turn])
+        self.t_out_ns = self.stamps_ns[-1]
+        return rest
+
+    def _turning_point(self, xy: np.ndarray) -> int | None:
+        """Index of the scan farthest from xy since the robot was there before."""
         path = np.array([*self.path, xy])
         travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-        old = travelled < travelled[-1] - RETURN_PATH_M
-        return bool((np.linalg.norm(path[old] - xy, axis=1) < RETURN_REACH_M).any())
+        away = np.linalg.norm(path - xy, axis=1)
+        before = np.flatnonzero((travelled < travelled[-1] - RETURN_PATH_M) & (away < RETURN_REACH_M))
+        if len(before) == 0:
+            return None
+        return int(before[-1] + np.argmax(away[before[-1] :]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +148,7 @@ class SceneTracker:
     def _start_current(self, scan_id: int, stamp_ns: int, xy: np.ndarray, descriptor: np.ndarray) -> None:
         self._hull = convex_hull(xy)
         self._descriptors = [descriptor]
-        self._current = Visit(self._next_scene_id, 1, stamp_ns, stamp_ns, [scan_id], [xy])
+        self._current = Visit(self._next_scene_id, 1, stamp_ns, stamp_ns, [scan_id], [xy], [stamp_ns])
         self._next_scene_id += 1
 
     def _close_current(self) -> Scene:
@@ -159,7 +181,13 @@ class SceneTracker:
             for scene_id, visit in self._open_visits.items()
             if distance_m(self._scenes[scene_id].hull, xy) > reach or self._is_over(visit, stamp_ns, xy)
         ]
-        return [self._open_visits.pop(scene_id) for scene_id in over]
+        ended = [self._open_visits.pop(scene_id) for scene_id in over]
+        for visit in ended:
+            rest = visit.split_off_return(xy)
+            if rest is not None:
+                self._scenes[visit.scene_id].n_visits = rest.number
+                self._open_visits[visit.scene_id] = rest
+        return ended
 
     def _is_over(self, visit: Visit, stamp_ns: int, xy: np.ndarray) -> bool:
         """Visits that last, or in which the robot comes back on its path, are cut: results come while it is there."""

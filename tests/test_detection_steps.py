@@ -155,14 +155,14 @@ def test_what_the_own_visit_looks_through_has_not_stayed():
     standing = image(wall_at(5.0, half_width=0.3))
     person = np.array([[5, 0, 0]], np.float32)
     scan = np.zeros(1, np.int16)
-    stamps = np.arange(4)
+    stamps = np.arange(5)
 
     def submap(images, visit):
         return Submap(with_person, np.zeros(len(with_person), np.int16), images, np.array(visit), stamps)
 
     walked_on = submap([standing, empty, empty, empty], [1, 1, 1, 1])
     stayed = submap([standing] * 4, [1, 1, 1, 1])
-    appeared_later = submap([standing, standing, empty, empty], [2, 2, 1, 1])
-    assert not persistent(person, scan, walked_on, 0.3, 18.0)[0]
-    assert persistent(person, scan, stayed, 0.3, 18.0)[0]
-    assert persistent(person, scan, appeared_later, 0.3, 18.0)[0]
+    appeared_later = submap([standing] * 3 + [empty, empty], [2, 2, 2, 1, 1])
+    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3)[0]
+    assert persistent(person, scan, stayed, 0.3, 18.0, 3)[0]
+    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3)[0]

@@ -15,7 +15,6 @@ from .occlusion import latest_sight, persistent, scans_looking_through
 from .submap import Submap
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
-MIN_SEEN_BY = 2  # scans of its own visit that must have seen an object
 
 
 @dataclass(frozen=True)
@@ -30,6 +29,7 @@ class Thresholds:
     occlusion_range_m: float
     occlusion_margin_m: float
     min_confirming_scans: int
+    min_showing_scans: int
     cluster_distance_m: float
     min_points: int
     ground_filter_c1_m: float
@@ -107,14 +107,16 @@ def _one_way(
     seen = latest_sight(points, other, t.occlusion_margin_m, t.occlusion_range_m, t.min_confirming_scans)
     confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
     possible = confirmed | (seen.at <= seen.through)
-    possible[possible] = persistent(points[possible], scan[possible], this, t.occlusion_margin_m, t.occlusion_range_m)
+    possible[possible] = persistent(
+        points[possible], scan[possible], this, t.occlusion_margin_m, t.occlusion_range_m, t.min_showing_scans
+    )
     confirmed &= possible
     watch.lap("occlusion")
     objects = []
     for member in _objects(points, confirmed, possible, t.cluster_distance_m):
         kept = member[thin(points[member])]
         own_scans = np.unique(scan[member])
-        if len(kept) < t.min_points or len(own_scans) < MIN_SEEN_BY:
+        if len(kept) < t.min_points or len(own_scans) < t.min_showing_scans:
             continue
         if is_ground_like(points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
             continue

@@ -49,20 +49,23 @@ def latest_sight(points: np.ndarray, other: Submap, margin_m: float, range_m: fl
     return result
 
 
-def persistent(points: np.ndarray, scan: np.ndarray, own: Submap, margin_m: float, range_m: float) -> np.ndarray:
+def persistent(
+    points: np.ndarray, scan: np.ndarray, own: Submap, margin_m: float, range_m: float, min_scans: int
+) -> np.ndarray:
     """Which points (N, 3), each of scan (N,) of its own submap, stayed where they were through their own visit.
 
-    A thing that is there to stay is not looked through by the other scans of the visit that saw it; a walking
-    person is, and so are leaves in the wind. Scans of other visits must not be asked: they did look through
-    what appeared later.
+    A thing that is there to stay is met by several scans of the visit that saw it, and hardly ever looked
+    through by them; a walking person is gone in the next scan, and leaves in the wind let beams through. That
+    nothing looks through is not enough: before the sky there is no return behind a walker's head. Scans of other
+    visits must not be asked: they did look through what appeared later.
     """
-    out = np.ones(len(points), dtype=bool)
+    out = np.zeros(len(points), dtype=bool)
     visit = own.visit[scan]
     for v in np.unique(visit):
         of_visit = np.flatnonzero(visit == v)
         images = [image for image, u in zip(own.images, own.visit, strict=True) if u == v]
         seen = sight(points[of_visit], images, margin_m, range_m)
-        out[of_visit] = (seen.through < 2) | (seen.through * 2 < seen.at)
+        out[of_visit] = (seen.at >= min_scans) & (seen.through * 2 < seen.at)
     return out
 
 
