@@ -112,7 +112,8 @@ def _rate(text: str) -> float | None:
 
 @cli.command()
 @DATA
-@click.option("--format", "form", type=click.Choice(["table", "json", "csv"]), default="table", show_default=True)
+@click.option("--format", "form", type=click.Choice(["table", "json", "csv"]), default="table", show_default=True,
+              help="For people, or for programs.")  # fmt: skip
 @click.option("--points", is_flag=True, help="Each change's points too (JSON).")
 @click.option("--min-points", default=0, show_default=True, help="Only changes of at least so many points.")
 def changes(data: Path, form: str, points: bool, min_points: int) -> None:
@@ -159,8 +160,9 @@ def plot(data: Path, output: Path) -> None:
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.option("--scenario", default="short", show_default=True, help="See --list.")
 @click.option("--seed", default=0, show_default=True, help="Another seed is another world and another patrol.")
-@click.option("--beams", type=click.Choice(["32", "64", "128"]), default="128", show_default=True)
-@click.option("--columns", type=click.Choice(["512", "1024", "2048"]), default="1024", show_default=True)
+@click.option("--beams", type=click.Choice(["32", "64", "128"]), default="128", show_default=True, help="Of the OS1.")
+@click.option("--columns", type=click.Choice(["512", "1024", "2048"]), default="1024", show_default=True,
+              help="Of a rotation.")  # fmt: skip
 @click.option("--profile", default="RNG19_RFL8_SIG16_NIR16", show_default=True, help="Of the lidar packets.")
 @click.option("--list", "list_", is_flag=True, is_eager=True, expose_value=False, callback=lambda *a: _list(*a),
               help="List the scenarios.")  # fmt: skip
@@ -172,6 +174,9 @@ def simulate(out: Path, scenario: str, seed: int, beams: str, columns: str, prof
 
 def _simulate(out: Path, scenario: str, seed: int, beams: int, columns: int, profile: str):
     virtual = _virtual()
+    if scenario not in virtual.SCENARIOS:
+        known = ", ".join(virtual.SCENARIOS)
+        raise click.BadParameter(f"{scenario!r} is not known; known: {known}", param_hint="--scenario")
     with click.progressbar(length=1000, label=f"simulating {scenario}", file=sys.stderr) as bar:
         done = 0
 
@@ -213,7 +218,7 @@ def demo(ctx: click.Context, out: Path, seed: int) -> None:
     from .demo import compare_with_truth, fresh
 
     fresh(out)
-    capture = _simulate(out / "patrol", "demo", seed, 128, 1024, "RNG19_RFL8_SIG16_NIR16")
+    capture = _simulate(out / "patrol", "demo", seed, 128, 1024, "RNG15_RFL8_NIR8")
     ctx.invoke(replay, source=str(capture.pcap), data=out / "data", meta=None, rate="max", config_path=None)
     click.echo()
     ctx.invoke(changes, data=out / "data", form="table", points=False, min_points=0)
