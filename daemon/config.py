@@ -105,7 +105,7 @@ class DetectionConfig(_Section):
     min_confirming_scans: int = Field(2, ge=1, description="scans that must have looked through the place of a change")
     min_showing_scans: int = Field(3, ge=1, description="scans of its own visit that must have met a thing: walkers are met once or twice")
     cluster_distance_m: float = Field(0.4, gt=0, description="points nearer than this belong to one object")
-    min_points: int = Field(20, ge=1, description="5 cm voxels that an object must have")
+    min_points: int = Field(20, ge=1, description="confirmed points (5 cm voxels) that an object must have")
     ground_filter_c1_m: float = Field(0.15, gt=0, description="B1: distance of an object's mean to the ground plane")
     ground_filter_c2: float = Field(0.9, gt=0, description="B2: Bhattacharyya covariance term")
 

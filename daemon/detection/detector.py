@@ -15,6 +15,7 @@ from .occlusion import latest_sight, persistent, scans_looking_through
 from .submap import Submap
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
+MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
 
 @dataclass(frozen=True)
@@ -116,11 +117,11 @@ def _one_way(
     for member in _objects(points, confirmed, possible, t.cluster_distance_m):
         kept = member[thin(points[member])]
         own_scans = np.unique(scan[member])
-        if len(kept) < t.min_points or len(own_scans) < t.min_showing_scans:
+        sure = kept[confirmed[kept]]
+        if len(sure) < max(t.min_points, MIN_CONFIRMED_SHARE * len(kept)) or len(own_scans) < t.min_showing_scans:
             continue
         if is_ground_like(points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
             continue
-        sure = kept[confirmed[kept]]
         through = scans_looking_through(points[sure], other.images, t.occlusion_margin_m, t.occlusion_range_m)
         if len(through) < t.min_confirming_scans:
             continue
