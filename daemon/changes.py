@@ -77,8 +77,10 @@ class ChangeManager:
             self._observe(known, "still", found, finding)
             return False
         change_id = self._store.add(_change(found, finding, confidence, evidence))
-        for undone in touching:
-            self._observe(undone, "gone", found, finding, superseded_by=change_id)
+        for other in touching:
+            # Only what was there before: a door that opens disappears here and appears beside in one interval.
+            if (other.session, other.first_seen_ns) <= (finding.before_session, found.before_ns):
+                self._observe(other, "gone", found, finding, superseded_by=change_id)
         return True
 
     def publish_change_list(self, n: int) -> list[ChangeObject]:
