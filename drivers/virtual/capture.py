@@ -1,5 +1,6 @@
 """A whole patrol of the virtual OS1, written as a capture with its ground truth."""
 
+import os
 import pickle
 import queue
 import shutil
@@ -111,7 +112,9 @@ def _start(job: Job) -> subprocess.Popen:
     # A plain process rather than multiprocessing: it needs neither a fork beside running threads nor an importable
     # __main__, so that simulate() also works from a notebook or a script without a guard.
     command = [sys.executable, "-c", f"from {__package__}.worker import main; main()"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    # Small matrix products: more threads of BLAS than processes only wait for each other.
+    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=alone)
     with process.stdin:
         pickle.dump(job, process.stdin)
     return process

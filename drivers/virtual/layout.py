@@ -87,10 +87,10 @@ def houses(lay: Layout) -> list[tuple[Building, np.ndarray, float]]:
 def furnish(lay: Layout) -> None:
     """Everything that stands about and never changes."""
     stretch = lay.route.length_m / 100
-    lay.many(9 * stretch + 1, lambda: _parked_car(lay))
-    lay.many(5 * stretch, lambda: _fence(lay))
-    lay.many(4 * stretch, lambda: _long(lay, "hedge", shapes.hedge, 0.8, (2.0, 7.0)))
-    lay.many(3 * stretch, lambda: _long(lay, "wall", shapes.wall, 0.4, (2.5, 8.0)))
+    lay.many(16 * stretch + 2, lambda: _parked_car(lay))
+    lay.many(9 * stretch, lambda: _fence(lay))
+    lay.many(7 * stretch, lambda: _long(lay, "hedge", shapes.hedge, 0.8, (2.0, 7.0)))
+    lay.many(5 * stretch, lambda: _long(lay, "wall", shapes.wall, 0.4, (2.5, 8.0)))
     lay.many(0.8 * stretch, lambda: _long(lay, "container", lambda rng, _: shapes.container(rng), 2.5, (6.06, 6.07)))
     for shape, count, reach in (
         (shapes.lamp, 5, (0.1, 1.0)), (shapes.pole, 5, (0.0, 6.0)), (shapes.bench, 3, (0.5, 5.0)),
@@ -101,8 +101,9 @@ def furnish(lay: Layout) -> None:
     lay.many(30 * stretch + 6, lambda: _tree(lay, lay.beside(0.8, 22.0)[0]))
     low, high = lay.terrain.bounds
     lay.many(np.prod(high - low) / 160, lambda: _tree(lay, lay.anywhere()))
-    lay.many(26 * stretch + 4, lambda: _bush(lay))
-    _meadow(lay, int(420 * stretch) + 60)
+    lay.many(40 * stretch + 4, lambda: _bush(lay))
+    lay.many(7 * stretch + 1, lambda: _puddle(lay))
+    _meadow(lay, int(600 * stretch) + 60)
 
 
 def _small(lay: Layout, shape, reach) -> None:
@@ -160,7 +161,7 @@ def _tree(lay: Layout, xy) -> None:
     lay.site.take(disc(xy, 0.4))
     near = lay.terrain.to_road(xy) < NEAR_M
     shape = shapes.conifer if lay.rng.random() < 0.3 else shapes.tree
-    lay.put("tree", shape(lay.rng, int(lay.rng.uniform(600, 1300)) if near else 260), xy, lay.rng.uniform(0, 6))
+    lay.put("tree", shape(lay.rng, int(lay.rng.uniform(1200, 2400)) if near else 420), xy, lay.rng.uniform(0, 6))
 
 
 def _bush(lay: Layout) -> None:
@@ -168,6 +169,14 @@ def _bush(lay: Layout) -> None:
     if lay.fits(disc(xy, 0.8)):
         lay.site.take(disc(xy, 0.5))
         lay.put("bush", shapes.bush(lay.rng), xy, 0.0)
+
+
+def _puddle(lay: Layout) -> None:
+    """Water on the road or beside it; it takes no room."""
+    xy = lay.beside(-lay.edge_m, 3.0)[0]
+    if lay.site.is_free(disc(xy, 0.6), also_view=False):
+        mesh = shapes.puddle(lay.rng, lambda rim: lay.terrain.height(rim + xy))
+        lay.placed.append(("puddle", mesh.moved((*xy, 0.0))))
 
 
 def _meadow(lay: Layout, count: int) -> None:

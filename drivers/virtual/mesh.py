@@ -53,12 +53,11 @@ def rotation(yaw, pitch=0.0, roll=0.0) -> np.ndarray:
     """Radians (scalars or equal shapes ...) -> (..., 3, 3) float64, R = Rz(yaw) Ry(pitch) Rx(roll)."""
     yaw, pitch, roll = np.broadcast_arrays(yaw, pitch, roll)
     cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (np.cos, np.sin))
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2).astype(np.float64)
+    out = np.empty((*yaw.shape, 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = -sp, cp * sr, cp * cr
+    return out
 
 
 def merge(meshes) -> Mesh:

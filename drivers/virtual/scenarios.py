@@ -28,7 +28,7 @@ class Scenario:
     staged: tuple[Staged, ...]
     closed: bool = True  # a loop; otherwise a line driven there and back
     reversed_pass: int | None = None  # the pass that is driven against the first one's direction
-    speed_m_s: tuple[float, float] = (1.3, 2.0)
+    speed_m_s: tuple[float, float] = (1.4, 2.1)
     people_per_100_m: float = 5.0  # walking about, on each pass
     cars_per_100_m: float = 1.0  # driving along, on each pass
     margin_m: float = 50.0  # of furnished world around the route
@@ -38,7 +38,7 @@ SCENARIOS = {
     scenario.name: scenario
     for scenario in (
         Scenario(
-            "tiny", "for tests: there and back again, two changes", (13.0, 15.0), 2,
+            "tiny", "for tests: there and back again, two changes", (9.0, 10.0), 2,
             (Staged("person", 1), Staged("crate", 0, 0)),
             closed=False, reversed_pass=1, speed_m_s=(2.0, 2.2), people_per_100_m=12, margin_m=30.0,
         ),
@@ -59,7 +59,7 @@ SCENARIOS = {
                 Staged("fallen_tree", 2), Staged("bin", 2), Staged("house_door", 2), Staged("car", 0, 0),
                 Staged("bench", 0, 0), Staged("bin", 0, 0), Staged("person", 0, 1), Staged("pole", 0, 1),
             ),
-            reversed_pass=2,
+            reversed_pass=2, speed_m_s=(1.8, 2.4),
         ),
         Scenario("quiet", "three laps on which nothing changes; people and cars pass by", (100.0, 150.0), 3, ()),
         Scenario(

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from .mesh import Material
-from .raycast import MAX_RANGE_M, Hits
+from .raycast import MAX_RANGE_M, MIRROR_COS, Hits
 
 FIRMWARE = "v3.1.0"
 FOV_DEG = 42.4  # from the top beam to the bottom one
@@ -25,7 +25,7 @@ for _material, _share in (
 RANGE_OF_10_PERCENT_M = 55.0  # a 10 % target square to the beam is detected nine times in ten at this range
 DETECTION_SLOPE = 2.5  # of the log odds of detection over the log of the returned light
 LOST_ANYWAY = 0.004
-GLASS_MIRROR_COS = 0.985  # panes answer only where they are nearly square to the beam
+PANE_LOSS = 0.35  # of beams that have gone through a pane or by way of a puddle, beyond the light they lack
 BEAM_SPREAD_RAD = 0.0031
 EDGE_M = 0.25  # neighbouring ranges that differ by more meet an edge between them
 MIXED_SHARE = 0.22  # of the pixels at an edge, whose beam straddles it
@@ -88,7 +88,7 @@ def receive(hits: Hits, pixel_shift: np.ndarray, rng: np.random.Generator) -> di
     r = np.where(met, hits.range_m, np.float32(1.0))
     albedo = ALBEDO[hits.material]
     cosine = np.maximum(hits.incidence, np.float32(0.02))
-    light = albedo * (0.1 + 0.9 * cosine) / (0.1 * (r / RANGE_OF_10_PERCENT_M) ** 2)
+    light = hits.clarity * albedo * (0.1 + 0.9 * cosine) / (0.1 * (r / RANGE_OF_10_PERCENT_M) ** 2)
     detected = met & (rng.random(shape, np.float32) > _loss(hits, light, cosine))
     mixed_m, object_id = _straddle(r, hits.object_id, detected, pixel_shift, rng)
     noisy = mixed_m + _spread(r, cosine, hits.material) * rng.standard_normal(shape, np.float32)
@@ -108,8 +108,10 @@ def _loss(hits: Hits, light: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """Chance that a beam which met something brings nothing back: weak light, panes, puddles."""
     odds = 9.0 * np.maximum(light, np.float32(1e-6)) ** np.float32(DETECTION_SLOPE)
     loss = LOST_ANYWAY + (1 - LOST_ANYWAY) / (1 + odds)
-    glass = hits.material == Material.GLASS
-    loss[glass] = np.where(cosine[glass] > GLASS_MIRROR_COS, loss[glass], np.float32(0.88))
+    loss[hits.clarity < 1] = 1 - (1 - PANE_LOSS) * (1 - loss[hits.clarity < 1])
+    # Panes of moving cars, behind which nothing is cast.
+    slanted = (hits.material == Material.GLASS) & (cosine < MIRROR_COS)
+    loss[slanted] = np.float32(0.9)
     return loss
 
 

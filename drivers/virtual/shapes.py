@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .mesh import Material, Mesh, box, ellipsoid, leaves, merge, quads, tube
+from .mesh import Material, Mesh, box, ellipsoid, leaves, merge, quads, triangles, tube
 
 Rng = np.random.Generator
 
@@ -133,7 +133,7 @@ def rock(rng: Rng) -> Mesh:
     return merge([body]).moved(yaw=rng.uniform(0, 6), scale=rng.uniform(0.8, 1.2, 3))
 
 
-def tree(rng: Rng, n_leaves: int = 700, tall: float = 1.0) -> Mesh:
+def tree(rng: Rng, n_leaves: int = 1500, tall: float = 1.0) -> Mesh:
     """A broad-leaved tree: bent trunk, boughs, leaf clouds that rays pass through."""
     h = rng.uniform(4.5, 9.0) * tall
     bend = rng.normal(0, 0.12, 2) * h / 6
@@ -150,11 +150,11 @@ def tree(rng: Rng, n_leaves: int = 700, tall: float = 1.0) -> Mesh:
     pick = rng.integers(0, len(tips), n_leaves)
     ball = rng.normal(0, 1, (n_leaves, 3))
     ball *= rng.random((n_leaves, 1)) ** 0.4 / np.linalg.norm(ball, axis=1, keepdims=True)
-    parts.append(leaves(tips[pick] + ball * h * [0.18, 0.18, 0.14], 0.16 * (700 / n_leaves) ** 0.4, rng))
+    parts.append(leaves(tips[pick] + ball * h * [0.18, 0.18, 0.14], 0.12 * (1500 / n_leaves) ** 0.4, rng))
     return merge(parts)
 
 
-def conifer(rng: Rng, n_leaves: int = 700, tall: float = 1.0) -> Mesh:
+def conifer(rng: Rng, n_leaves: int = 1500, tall: float = 1.0) -> Mesh:
     """A spruce: straight trunk, whorls of drooping twigs."""
     h = rng.uniform(4.0, 10.0) * tall
     level = rng.random(n_leaves) ** 0.7
@@ -164,16 +164,16 @@ def conifer(rng: Rng, n_leaves: int = 700, tall: float = 1.0) -> Mesh:
     centres = np.stack([reach * np.cos(angle), reach * np.sin(angle), z], 1)
     r = 0.018 * h
     trunk = tube([[0, 0, -0.3], [0, 0, 0.3], [0, 0, h]], [r * 1.4, r, 0.02], Material.WOOD)
-    return merge([trunk, leaves(centres, 0.15 * (700 / n_leaves) ** 0.4, rng)])
+    return merge([trunk, leaves(centres, 0.11 * (1500 / n_leaves) ** 0.4, rng)])
 
 
-def bush(rng: Rng, n_leaves: int = 260) -> Mesh:
+def bush(rng: Rng, n_leaves: int = 420) -> Mesh:
     """A shrub of 0.5 to 1.6 m."""
     half = rng.uniform(0.45, 0.9, 3) * [1, 1, 0.9]
     ball = rng.normal(0, 1, (n_leaves, 3))
     ball *= rng.random((n_leaves, 1)) ** 0.35 / np.linalg.norm(ball, axis=1, keepdims=True)
     stems = [tube([[0, 0, -0.1], [*rng.normal(0, 0.25, 2), half[2]]], [0.02, 0.01], Material.WOOD, 4) for _ in range(4)]
-    return merge([leaves(ball * half + [0, 0, half[2] * 0.95], 0.09, rng), *stems])
+    return merge([leaves(ball * half + [0, 0, half[2] * 0.95], 0.07, rng), *stems])
 
 
 def hedge(rng: Rng, length: float) -> Mesh:
@@ -192,13 +192,13 @@ def grass(rng: Rng, blades: int = 16) -> Mesh:
     tip = foot + np.concatenate([rng.normal(0, 0.1, (blades, 2)), rng.uniform(0.15, 0.5, (blades, 1))], 1)
     side = np.concatenate([rng.normal(0, 0.012, (blades, 2)), np.zeros((blades, 1))], 1)
     corner = np.stack([foot - side, foot + side, tip], 1)
-    return Mesh(*_loose(corner), np.full(blades, Material.LEAF, np.uint8))
+    return triangles(corner, Material.LEAF)
 
 
 def fallen_tree(rng: Rng) -> Mesh:
     """A young tree lying on the ground along x, 3.5 to 5.5 m long."""
     length = rng.uniform(3.5, 5.5)
-    upright = tree(rng, 260, tall=0.75)
+    upright = tree(rng, 400, tall=0.75)
     k = length / upright.vertices[:, 2].max()
     lying = upright.moved(pitch=np.pi / 2, scale=k).vertices
     lying[:, 0] -= length / 2
@@ -207,6 +207,19 @@ def fallen_tree(rng: Rng) -> Mesh:
     return Mesh(lying, upright.faces, upright.material)
 
 
-def _loose(corner) -> tuple[np.ndarray, np.ndarray]:
-    corner = np.asarray(corner, np.float32).reshape(-1, 3)
-    return corner, np.arange(len(corner), dtype=np.int32).reshape(-1, 3)
+def puddle(rng: Rng, height) -> Mesh:
+    """Standing water, 0.6 to 2 m across. height: function of xy (K, 2) -> ground height, about the origin."""
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    r = rng.uniform(0.3, 1.0) * (1 + 0.2 * np.sin(2 * angle + rng.uniform(0, 6)) + 0.1 * np.sin(5 * angle))
+    rim = np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
+    rim = np.concatenate([rim, height(rim)[:, None] + 0.012], 1)
+    middle = np.broadcast_to(rim.mean(0), rim.shape)
+    return triangles(np.stack([middle, rim, np.roll(rim, -1, 0)], 1), Material.WATER)
+
+
+def vehicle() -> Mesh:
+    """What a sensor on a mast sees of the robot below and behind it: deck, box, two antennas. Sensor frame."""
+    deck = box((1.35, 0.7, 0.05), Material.METAL, (-0.45, 0, -0.42))
+    case = box((0.3, 0.4, 0.26), Material.PLASTIC, (-0.85, 0, -0.37))
+    whips = [tube([[-0.65, y, -0.4], [-0.65, y, 0.3]], [0.012, 0.008], Material.PLASTIC, 6) for y in (-0.32, 0.32)]
+    return merge([deck, case, *whips])

@@ -1,12 +1,13 @@
 """The ground: slopes, waves, roughness, and the road with its kerbs."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.ndimage import distance_transform_edt
 
 from .mesh import Material, Mesh, quads
 from .routes import Route
 
 KERB_WIDTH_M = 0.15
+CELL_M = 0.25  # of the raster that says which point of the road is nearest
 
 
 class Terrain:
@@ -18,7 +19,7 @@ class Terrain:
         # A street that cars drive along, or a footpath.
         self.road_half_m = rng.uniform(3.3, 4.0) if rng.random() < 0.65 else rng.uniform(2.0, 2.4)
         self.kerb_m = float(rng.choice([0.0, 0.12, 0.14]))
-        self._tree, self._route = cKDTree(route.xy), route
+        self._route, self._nearest = route, _nearest_of(route.xy, self.bounds)
         waves = 9
         length = np.concatenate([rng.uniform(45, 120, 4), rng.uniform(12, 30, 5)])
         steep = np.concatenate([rng.uniform(0.005, 0.03, 4), rng.uniform(0.003, 0.010, 5)])
@@ -30,8 +31,11 @@ class Terrain:
         self._bumps = rng.normal(0, 1.0, (512, 512))
 
     def to_road(self, xy) -> np.ndarray:
-        """xy: (..., 2) -> (...) distance from the road's centre line, metres."""
-        return self._tree.query(np.asarray(xy, float))[0]
+        """xy: (..., 2) -> (...) distance from the road's centre line, metres (2 cm or better beside the road)."""
+        xy = np.asarray(xy, float)
+        cell = np.clip(((xy - self.bounds[0]) / CELL_M).astype(int), 0, np.array(self._nearest.shape) - 1)
+        gap = xy - self._route.xy[self._nearest[cell[..., 0], cell[..., 1]]]
+        return np.hypot(gap[..., 0], gap[..., 1])
 
     def slope_height(self, xy) -> np.ndarray:
         """xy: (..., 2) -> (...) height of the smooth ground (slopes and waves only), metres."""
@@ -89,3 +93,13 @@ class Terrain:
         low = b[i, j] * (1 - u) + b[(i + 1) % 512, j] * u
         high = b[i, (j + 1) % 512] * (1 - u) + b[(i + 1) % 512, (j + 1) % 512] * u
         return low * (1 - v) + high * v
+
+
+def _nearest_of(line: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """line: (N, 2) metres -> (X, Y) int32 over the bounds: index of the line's point nearest to each cell."""
+    shape = np.ceil((bounds[1] - bounds[0]) / CELL_M).astype(int)
+    on_line = np.full(shape, -1, np.int32)
+    i, j = ((line - bounds[0]) / CELL_M).astype(int).T
+    on_line[i, j] = np.arange(len(line))
+    nearest = distance_transform_edt(on_line < 0, return_distances=False, return_indices=True)
+    return on_line[tuple(nearest)]

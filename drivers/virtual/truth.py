@@ -5,32 +5,43 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from .worlds import World
 
 VOXEL_M = 0.05
-WITHIN_M = 30.0  # returns from farther away do not count as an object's visible surface
+CONFIRM_M = 0.15  # a surface point this near to a look through the thing can be confirmed by it
 
 
 class Truth:
-    """Collects frame by frame; `write` finishes. Map frame = the sensor's pose at the end of frame 0."""
+    """Collects frame by frame; `write` finishes. Map frame = the sensor's pose at the end of frame 0.
+
+    poses.txt: TUM lines, the pose at each frame's end on the sensor's clock.
+    changes.json: of each change its id, kind, polarity, the first pass that shows it, the object's id, the change it
+    is part of (the place that an opened door left) or null, its centroid, how many returns the sensor got from it in
+    the last pass with it before (disappeared) or the first after (appeared), these returns' points at 5 cm voxels,
+    and for each point whether the pass on the other side of the change looked through it (1) or not (0).
+    objects.json: the kind of each object id. labels.npz: for each frame (member "000000", ...) the object id (H, W) of
+    each return, staggered; 0 = no return.
+    """
 
     def __init__(self, folder: Path, world: World):
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._world = folder, world
         self._labels = zipfile.ZipFile(folder / "labels.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1)
         self._poses: dict[int, tuple[int, np.ndarray]] = {}
-        self._seen: dict[tuple[int, int], list[np.ndarray]] = {}
+        self._seen: dict[tuple[int, int], list[np.ndarray]] = {}  # by (object, pass): parts (K, 3)
+        self._looks: dict[tuple[int, int], list[np.ndarray]] = {}
 
     def add(self, shot) -> None:
         """shot: worker.Shot of one frame; in any order."""
         with self._labels.open(f"{shot.index:06d}.npy", "w") as member:
             np.lib.format.write_array(member, shot.labels)
         self._poses[shot.index] = (shot.stamp_ns, shot.T_world_sensor)
-        for number in np.unique(shot.surface[:, 0]).astype(int):
-            mine = shot.surface[shot.surface[:, 0] == number, 1:]
-            self._seen.setdefault((number, shot.pass_index), []).append(mine)
+        for rows, book in ((shot.surface, self._seen), (shot.looks, self._looks)):
+            for number in np.unique(rows[:, 0]).astype(int):
+                book.setdefault((number, shot.pass_index), []).append(rows[rows[:, 0] == number, 1:])
 
     def write(self) -> None:
         """Write poses.txt, changes.json, objects.json; labels.npz is complete after this."""
@@ -44,17 +55,24 @@ class Truth:
 
     def _change(self, index: int, T_map_world: np.ndarray) -> dict:
         change = self._world.changes[index]
-        seen_in = change.pass_index - (change.polarity == "disappeared")
-        parts = self._seen.get((change.object_id, seen_in), [])
-        points = np.concatenate(parts) if parts else np.zeros((0, 3))
-        mesh = self._world.items[change.object_id - 1].mesh.vertices
-        surface = thin(points, VOXEL_M) @ T_map_world[:3, :3].T + T_map_world[:3, 3]
-        centroid = surface.mean(0) if len(surface) else T_map_world[:3, :3] @ mesh.mean(0) + T_map_world[:3, 3]
+        before, after = change.pass_index - 1, change.pass_index
+        seen_in, absent_in = (after, before) if change.polarity == "appeared" else (before, after)
+        returns = _gathered(self._seen, change.object_id, seen_in)
+        surface = thin(returns, VOXEL_M)
+        looks = thin(_gathered(self._looks, change.object_id, absent_in), VOXEL_M)
+        confirmable = cKDTree(looks).query(surface)[0] < CONFIRM_M if len(looks) and len(surface) else np.zeros(len(surface), bool)
+        middle = surface.mean(0) if len(surface) else self._world.items[change.object_id - 1].mesh.vertices.mean(0)
+        centroid, surface = (points @ T_map_world[:3, :3].T + T_map_world[:3, 3] for points in (middle, surface))
         return {
             "id": index, "kind": change.kind, "polarity": change.polarity, "pass": change.pass_index,
             "object": change.object_id, "part_of": change.part_of, "centroid": centroid.round(3).tolist(),
-            "n_visible_returns": len(points), "points": surface.round(3).tolist(),
+            "n_visible_returns": len(returns), "points": surface.round(3).tolist(),
+            "confirmable": confirmable.astype(int).tolist(),
         }
+
+
+def _gathered(book: dict, number: int, pass_index: int) -> np.ndarray:
+    return np.concatenate(book.get((number, pass_index), [np.zeros((0, 3))]))
 
 
 def thin(points: np.ndarray, cell_m: float) -> np.ndarray:

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..frame import Sensor
 from ..metadata import sensor_from_metadata
 from .packets import BOOT_NS, Encoder
 from .pcap import Records
-from .raycast import Caster, Hits
+from .raycast import Caster
 from .scenarios import Scenario
 from .sensor import LIDAR_PORT, receive
-from .truth import WITHIN_M
+from .witness import Witness
 from .worlds import World, build_world
 
 
@@ -40,7 +39,8 @@ class Shot:
     T_world_sensor: np.ndarray  # (4, 4) there
     pass_index: int
     labels: np.ndarray  # (H, W) uint16: whose return each pixel is, 0 where it has none
-    surface: np.ndarray  # (K, 4): object id and point met (world frame) of the returns of changing objects
+    surface: np.ndarray  # (K, 4): see Witness.surface
+    looks: np.ndarray  # (K, 4): see Witness.looks
 
 
 def run(job: Job, world: World) -> Iterator[Shot]:
@@ -57,29 +57,21 @@ def run(job: Job, world: World) -> Iterator[Shot]:
 def frames(job: Job, world: World) -> Iterator[tuple[Shot, list]]:
     """-> (Shot, the LidarPackets) of each frame."""
     encoder, sensor = Encoder(job.metadata), sensor_from_metadata(job.metadata)
-    watched = np.array(sorted({change.object_id for change in world.changes}), np.uint16)
-    caster, cast_pass = None, None
+    current = None
     for index in range(job.first, job.stop):
         stamp = encoder.column_ns(index)
         t_s = (stamp - BOOT_NS) * 1e-9
         pass_index = world.patrol.pass_at(t_s[0])
-        if pass_index != cast_pass:
-            caster, cast_pass = Caster(world, pass_index), pass_index
+        if pass_index != current:
+            current = pass_index
+            caster, witness = Caster(world, pass_index, with_vehicle=True), Witness(world, pass_index)
         pose = world.patrol.pose(t_s)
         hits = caster.trace(sensor, pose, t_s)
         fields = receive(hits, sensor.pixel_shift, np.random.default_rng([job.seed, index]))
         packets = encoder.packets(encoder.frame(index, fields))
-        surface = _surface(sensor, pose, hits, fields["object"], watched)
-        yield Shot(index, int(stamp[-1]), pose[-1], pass_index, fields["object"], surface), packets
-
-
-def _surface(sensor: Sensor, pose: np.ndarray, hits: Hits, labels: np.ndarray, watched: np.ndarray) -> np.ndarray:
-    """(K, 4): object id and true point (world frame) of the returns of watched objects."""
-    seen = np.isin(labels, watched) & (labels == hits.object_id) & (hits.range_m < WITHIN_M)
-    row, column = np.nonzero(seen)
-    local = sensor.direction[row, column].astype(float) * hits.range_m[row, column, None] + sensor.offset[row, column]
-    point = np.einsum("kij,kj->ki", pose[column, :3, :3], local) + pose[column, :3, 3]
-    return np.concatenate([labels[row, column, None], point], 1)
+        labels = fields["object"]
+        surface, looks = witness.surface(sensor, pose, hits, labels), witness.looks(sensor, pose, fields["RANGE"])
+        yield Shot(index, int(stamp[-1]), pose[-1], pass_index, labels, surface, looks), packets
 
 
 def main() -> None:

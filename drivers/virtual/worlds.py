@@ -54,8 +54,8 @@ class World:
 
     @property
     def kinds(self) -> list[str]:
-        """Kind of each object id; id 0 is no return."""
-        return ["nothing", *(item.kind for item in self.items), *(mover.kind for mover in self.movers)]
+        """Kind of each object id; id 0 is no return, the last one the robot itself."""
+        return ["nothing", *(item.kind for item in self.items), *(mover.kind for mover in self.movers), "vehicle"]
 
 
 def build_world(scenario: Scenario, seed: int) -> World:
