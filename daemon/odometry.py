@@ -23,6 +23,8 @@ from kiss_icp.kiss_icp import KissICP  # noqa: E402
 MIN_POINTS = 1000  # fewer registrable returns than this say nothing about a pose
 CHECK_EVERY = 5  # frames between two looks at the overlap (15 ms each)
 OVERLAP_SAMPLE = 2000
+MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth
+GAP_FRAMES = 1.5  # more than a jittering period: frames are missing
 
 
 class Health(str, Enum):
@@ -73,15 +75,20 @@ class Odometry:
         gap_frames = self._gap_frames(frame)
         if gap_frames > MAX_GAP_FRAMES:
             return Motion(previous, np.eye(4), Health.LOST_GAP)
-        if gap_frames > 1.5:
+        if gap_frames > GAP_FRAMES:
             # The constant-velocity guess assumes one period between frames; stretch it over the hole.
             self._kiss.last_delta = fraction_of(self._kiss.last_delta, gap_frames)
+        map_before = self._kiss.local_map.point_cloud() if self._frames % CHECK_EVERY == CHECK_EVERY - 1 else None
         self._kiss.register_frame(points, times)
         T_odom_sensor = self._kiss.last_pose.copy()
         motion = inverse(previous) @ T_odom_sensor if self._frames else np.eye(4)
-        if gap_frames > 1.5:
+        if gap_frames > GAP_FRAMES:
             self._kiss.last_delta = fraction_of(motion, 1.0 / gap_frames)
-        health = self._verdict(motion, gap_frames * frame.sensor.frame_period_ns * 1e-9, points)
+        health = self._verdict(motion, gap_frames * frame.sensor.frame_period_ns * 1e-9)
+        if health is Health.GOOD and map_before is not None:
+            # Against the map without this scan: on the one with it every scan lies.
+            if self._overlap(points, map_before) < self._config.min_overlap:
+                health = Health.LOST_NO_OVERLAP
         self._stamp_ns = frame.stamp_ns
         self._frames += 1
         return Motion(T_odom_sensor, self._sweep(frame, motion, gap_frames), health)
@@ -112,24 +119,20 @@ class Odometry:
         share = (times.max() - times.min()) / (gap_frames * frame.sensor.frame_period_ns)
         return fraction_of(motion, min(share, 1.0))
 
-    def _verdict(self, motion: np.ndarray, seconds: float, points: np.ndarray) -> Health:
+    def _verdict(self, motion: np.ndarray, seconds: float) -> Health:
         if self._frames == 0:
             return Health.GOOD
         speed = np.linalg.norm(motion[:3, 3]) / seconds
         turn = np.degrees(rotation_angle_rad(motion)) / seconds
         if speed > self._config.max_speed_mps or turn > self._config.max_turn_dps:
             return Health.LOST_IMPLAUSIBLE_MOTION
-        if self._frames % CHECK_EVERY == 0 and self._overlap(points) < self._config.min_overlap:
-            return Health.LOST_NO_OVERLAP
         return Health.GOOD
 
-    def _overlap(self, points: np.ndarray) -> float:
+    def _overlap(self, points: np.ndarray, map_before: np.ndarray) -> float:
         """Share of a sample of the scan with a local map point within one voxel's diagonal."""
-        sample = points[:: max(1, len(points) // OVERLAP_SAMPLE)]
+        kept = points[(points**2).sum(axis=1) < self._config.max_range_m**2]  # the map ends there
+        sample = kept[:: max(1, len(kept) // OVERLAP_SAMPLE)]
         in_map = transform(self._kiss.last_pose, sample)
         reach = np.sqrt(3.0) * self._config.voxel_size_m
-        tree = cKDTree(self._kiss.local_map.point_cloud())
+        tree = cKDTree(map_before)
         return float(np.isfinite(tree.query(in_map, distance_upper_bound=reach)[0]).mean())
-
-
-MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth

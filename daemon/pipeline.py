@@ -11,7 +11,7 @@ import logging
 from dataclasses import dataclass
 
 from ..drivers.frame import Frame
-from ..drivers.gate import FrameGate
+from ..drivers.gate import FrameGate, Rejection
 from ..models.descriptor import DescriptorModel
 from ..storage.scans import Scan
 from ..storage.store import Store
@@ -25,6 +25,8 @@ from .session import Session
 from .worker import DetectionWorker
 
 logger = logging.getLogger(__name__)
+
+CLOCK_RESET_FRAMES = 5  # half a second of frames from the past is no reordering of packets
 
 
 @dataclass
@@ -58,13 +60,16 @@ class Pipeline:
         self._model, self._worker = model, worker
         self._source, self._wait = source, wait
         self._session: Session | None = None
+        self._clock_back = 0  # frames in a row whose time was not after the last accepted one
 
     def process(self, frame: Frame) -> None:
         """One rotation of the sensor."""
         self.counts.frames += 1
-        if self.gate.check(frame) is not None:
-            self.counts.rejected += 1
+        rejection = self.gate.check(frame)
+        if rejection is not None:
+            self._reject(rejection)
             return
+        self._clock_back = 0
         session = self._session or self._start_session(frame)
         motion = session.odometry.register(frame)
         if motion.health.lost:
@@ -78,6 +83,15 @@ class Pipeline:
             self._note(self._session, self._session.scenes.finish())
             self._store.index.end_session(self._session.session_id)
             self._session = None
+
+    def _reject(self, rejection: Rejection) -> None:
+        """A late frame is skipped; a clock that stays back was reset (reboot, looped capture): a session of its own."""
+        self.counts.rejected += 1
+        self._clock_back = self._clock_back + 1 if rejection is Rejection.TIME_NOT_INCREASING else 0
+        if self._clock_back == CLOCK_RESET_FRAMES:
+            logger.warning("the sensor's clock began anew")
+            self.finish()
+            self.gate.restart()
 
     def _keep(self, session: Session, frame: Frame, motion: Motion) -> None:
         """A key scan: find where it is, describe it, store it, and tell the scenes."""

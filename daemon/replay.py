@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from .instances import ChangeDetection
 from .pipeline import Counts, Pipeline
 from .sensors import Sensors
 from .worker import DetectionWorker
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,16 @@ def replay(
         detection = ChangeDetection(config, store, model.model_id)
         worker = DetectionWorker(detection.run, config.worker.queue_size)
         try:
-            pipeline = Pipeline(config, store, Sensors(store.dir), model, worker, source, wait=rate is None)
-            for frame in _paced(frames, rate):
-                pipeline.process(frame)
-                progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
+            recorded = frames.n_frames_estimate is not None  # a live sensor waits for nobody
+            pipeline = Pipeline(
+                config, store, Sensors(store.dir), model, worker, source, wait=recorded and rate is None
+            )
+            try:
+                for frame in _paced(frames, rate):
+                    pipeline.process(frame)
+                    progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
+            except KeyboardInterrupt:
+                logger.info("interrupted: closing the session")
             pipeline.finish()
             worker.drain()
         finally:

@@ -55,6 +55,10 @@ class FrameGate:
             self._last_stamp_ns = frame.stamp_ns
         return rejection
 
+    def restart(self) -> None:
+        """Forget the last frame: the sensor's clock began anew. What was counted stays."""
+        self._last_stamp_ns = self._last_frame_id = None
+
     def require_accepted(self, source: str) -> None:
         """Raises BadCapture where no frame of the source has been accepted, once it is read to its end."""
         if not self.accepted:

@@ -1,0 +1,81 @@
+"""Odometry: true poses from packets, and a verdict instead of an abort or a silent drift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from revisitd.daemon.config import Config
+from revisitd.daemon.odometry import Health, Odometry
+from revisitd.drivers.ouster import open_source
+
+virtual = pytest.importorskip("revisitd.drivers.virtual", reason="the virtual sensor needs the extra [sim]")
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """Frames of the first six seconds of a small patrol, and the sensor's true pose at the end of each."""
+    capture = virtual.simulate(tmp_path_factory.mktemp("drive"), scenario="tiny", seed=1, beams=32, max_s=6.0)
+    with open_source(str(capture.pcap)) as source:
+        frames = list(source)
+    return frames, np.loadtxt(capture.truth / "poses.txt")[: len(frames), 1:4]
+
+
+def odometry():
+    return Odometry(Config().odometry)
+
+
+def run(frames):
+    known = odometry()
+    return [known.register(frame) for frame in frames]
+
+
+def test_the_pose_is_the_sensors_at_the_end_of_each_sweep(drive):
+    frames, truth = drive
+    motions = run(frames)
+    assert all(motion.health is Health.GOOD for motion in motions)
+    ours = np.array([motion.T_odom_sensor[:3, 3] for motion in motions])
+    assert np.linalg.norm(truth[-1] - truth[0]) > 4.0
+    assert np.linalg.norm(ours[-1] - truth[-1]) < 0.25
+
+
+def test_the_sweeps_motion_is_that_between_two_ends(drive):
+    frames, truth = drive
+    last = run(frames)[-1]
+    assert np.linalg.norm(last.T_start_end[:3, 3]) == pytest.approx(np.linalg.norm(truth[-1] - truth[-2]), abs=0.08)
+
+
+def test_the_same_frames_give_the_same_poses_to_the_bit(drive):
+    first, second = run(drive[0][:20]), run(drive[0][:20])
+    assert all((a.T_odom_sensor == b.T_odom_sensor).all() for a, b in zip(first, second, strict=True))
+
+
+def test_a_frame_of_one_column_is_too_little_and_does_not_abort(drive):
+    known, frame = odometry(), drive[0][0]
+    one = np.zeros_like(frame.column_valid)
+    one[100] = True
+    assert known.register(replace(frame, column_valid=one)).health is Health.LOST_TOO_FEW_RETURNS
+
+
+def test_a_blinded_sensor_is_lost_and_not_standing_still(drive):
+    known = odometry()
+    known.register(drive[0][0])
+    blind = replace(drive[0][1], range_mm=np.zeros_like(drive[0][1].range_mm))
+    assert known.register(blind).health.lost
+
+
+def test_a_scan_of_another_place_does_not_lie_on_the_map(drive):
+    known, frames = odometry(), drive[0]
+    for frame in frames[:4]:
+        known.register(frame)
+    rng = np.random.default_rng(0)
+    elsewhere = replace(frames[4], range_mm=rng.integers(2_000, 60_000, frames[4].range_mm.shape).astype(np.uint32))
+    assert known.register(elsewhere).health.lost
+
+
+def test_a_long_gap_is_lost_and_a_short_one_is_not(drive):
+    frames = drive[0]
+    known = odometry()
+    known.register(frames[10])
+    assert known.register(frames[13]).health is Health.GOOD
+    assert known.register(frames[25]).health is Health.LOST_GAP
