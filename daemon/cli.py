@@ -11,7 +11,7 @@ import click
 from .. import __version__
 from ..drivers.errors import BadCapture, BadMetadata, DriverError, SensorUnavailable, SourceNotFound
 from ..storage.errors import StorageError
-from .config import Config, ConfigError, dump_config, load_config
+from .config import ConfigError, dump_config, load_config
 
 # sysexits.h; systemd prints these names. 2 is click's own code for a wrong use of a command.
 EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (

@@ -67,8 +67,12 @@ class SceneConfig(_Section):
     margin_m: float = Field(
         2.5, gt=0, description="a scene is its hull grown by this: a straight path has an area, a second lane is inside"
     )
-    exit_margin_m: float = Field(1.0, ge=0, description="a visit ends this far beyond the margin (no flicker on the rim)")
-    max_visit_s: float = Field(120.0, gt=0, description="a visit that lasts longer is cut, so that results come while there")
+    exit_margin_m: float = Field(
+        1.0, ge=0, description="a visit ends this far beyond the margin (no flicker on the rim)"
+    )
+    max_visit_s: float = Field(
+        120.0, gt=0, description="a visit that lasts longer is cut, so that results come while there"
+    )
 
 
 class SubmapConfig(_Section):
@@ -89,21 +93,35 @@ class AlignmentConfig(_Section):
         0.01, ge=0, description="drift expected per metre since the last fix: how far out a scene is looked for"
     )
     min_inlier_ratio: float = Field(0.6, gt=0, le=1, description="share of the scan that must find a partner")
-    max_residual_m: float = Field(0.12, gt=0, description="root mean square distance to the reference's surface, at most")
+    max_residual_m: float = Field(
+        0.12, gt=0, description="root mean square distance to the reference's surface, at most"
+    )
 
 
 class DetectionConfig(_Section):
     """Change detection between two submaps (CDSD section III-C)."""
 
-    tau_m: float = Field(0.3, gt=0, description="mean distance to n neighbours beyond which a point is a candidate (Table II)")
+    tau_m: float = Field(
+        0.3, gt=0, description="mean distance to n neighbours beyond which a point is a candidate (Table II)"
+    )
     n: int = Field(5, ge=1, description="neighbours; 1 to 5 make no difference by study")
-    rho_m: float = Field(0.15, gt=0, description="noise filter: mean distance to n neighbours among candidates, at most")
-    ground_sigmas: float = Field(3.0, gt=0, description="Mahalanobis distance to the ground plane below which a point is ground")
-    ground_min_sigma_m: float = Field(0.035, gt=0, description="floor of the ground's spread: range noise and pose error")
+    rho_m: float = Field(
+        0.15, gt=0, description="noise filter: mean distance to n neighbours among candidates, at most"
+    )
+    ground_sigmas: float = Field(
+        3.0, gt=0, description="Mahalanobis distance to the ground plane below which a point is ground"
+    )
+    ground_min_sigma_m: float = Field(
+        0.035, gt=0, description="floor of the ground's spread: range noise and pose error"
+    )
     occlusion_range_m: float = Field(18.0, gt=0, description="a scan farther away confirms nothing")
-    occlusion_margin_m: float = Field(0.3, gt=0, description="how far behind a point a return must lie to have passed through it")
+    occlusion_margin_m: float = Field(
+        0.3, gt=0, description="how far behind a point a return must lie to have passed through it"
+    )
     min_confirming_scans: int = Field(2, ge=1, description="scans that must have looked through the place of a change")
-    min_showing_scans: int = Field(3, ge=1, description="scans of its own visit that must have met a thing: walkers are met once or twice")
+    min_showing_scans: int = Field(
+        3, ge=1, description="scans of its own visit that must have met a thing: walkers are met once or twice"
+    )
     cluster_distance_m: float = Field(0.4, gt=0, description="points nearer than this belong to one object")
     min_points: int = Field(20, ge=1, description="confirmed points (5 cm voxels) that an object must have")
     ground_filter_c1_m: float = Field(0.15, gt=0, description="B1: distance of an object's mean to the ground plane")
@@ -113,7 +131,9 @@ class DetectionConfig(_Section):
 class WorkerConfig(_Section):
     """The detection thread."""
 
-    queue_size: int = Field(8, ge=1, description="instances that may wait; a live robot drops the newest beyond, and counts it")
+    queue_size: int = Field(
+        8, ge=1, description="instances that may wait; a live robot drops the newest beyond, and counts it"
+    )
 
 
 class Config(_Section):

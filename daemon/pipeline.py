@@ -99,7 +99,8 @@ class Pipeline:
             frame.sensor.points(frame.range_mm), column_phase(frame.column_ns, frame.column_valid), motion.T_start_end
         )
         returns = points[(frame.range_mm > 0) & frame.column_valid]
-        fix = session.localizer.locate(returns, motion.T_odom_sensor, session.scenes_to_align_with(motion.T_odom_sensor))
+        scenes = session.scenes_to_align_with(motion.T_odom_sensor)
+        fix = session.localizer.locate(returns, motion.T_odom_sensor, scenes)
         scan = self._scan(session, frame, motion, fix)
         self._store.add_scan(scan)
         self.counts.key_scans += 1

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..drivers.frame import Frame
 from ..drivers.ouster import Source, open_source
 from ..models.descriptor import DescriptorModel
 from ..storage.store import Store

@@ -16,8 +16,9 @@ MID_SWEEP = 0.5
 
 
 def swept_points(scan: Scan, sensor: Sensor, phase: float) -> tuple[np.ndarray, np.ndarray]:
-    """All pixels as seen at one phase of the sweep, (H, W, 3) float32 metres sensor frame, and which are returns (H, W)."""
-    points = deskew(sensor.points(scan.range_mm), column_phase(scan.column_ns, scan.column_valid), scan.T_start_end, phase)
+    """All pixels as seen at one phase of the sweep, (H, W, 3) float32 metres, sensor frame; which are returns."""
+    columns = column_phase(scan.column_ns, scan.column_valid)
+    points = deskew(sensor.points(scan.range_mm), columns, scan.T_start_end, phase)
     return points, (scan.range_mm > 0) & scan.column_valid
 
 

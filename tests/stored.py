@@ -1,6 +1,7 @@
 """Small scans, sessions and changes for the tests of the storage."""
 
 import numpy as np
+
 from revisitd.storage.changes import Change
 from revisitd.storage.scans import Scan
 

@@ -16,6 +16,7 @@ from captures import (
     ranges_mm,
     write_capture,
 )
+
 from revisitd.drivers.errors import BadCapture, BadMetadata, DriverError, SourceNotFound
 from revisitd.drivers.gate import FrameGate
 from revisitd.drivers.losses import Loss

@@ -5,10 +5,11 @@ import threading
 
 import numpy as np
 import pytest
+from stored import make_change
+
 from revisitd.storage.changes import ChangeStore
 from revisitd.storage.errors import StorageError
 from revisitd.storage.schema import CHANGES_MIGRATIONS
-from stored import make_change
 
 UUID = "00000000-0000-0000-0000-000000000001"
 

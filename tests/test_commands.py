@@ -54,4 +54,5 @@ def test_printed_settings_pass_the_check(tmp_path):
 
 def test_scenarios_are_listed():
     pytest.importorskip("revisitd.drivers.virtual", reason="the virtual sensor needs the extra [sim]")
-    assert {"demo", "short", "long", "quiet"} <= {line.split()[0] for line in invoke("simulate", "--list").output.splitlines()}
+    names = {line.split()[0] for line in invoke("simulate", "--list").output.splitlines()}
+    assert {"demo", "short", "long", "quiet"} <= names

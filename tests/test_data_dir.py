@@ -9,10 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from stored import SESSION, make_scan
+
 from revisitd.storage.datadir import DataDir
 from revisitd.storage.errors import DatabaseFileError, DataDirBusy, DataDirError, NewerFormat
 from revisitd.storage.store import Store
-from stored import SESSION, make_scan
 
 
 def test_a_data_directory_is_made_where_there_is_none_and_keeps_its_identity(tmp_path):

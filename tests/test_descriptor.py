@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import yard
+
 from revisitd.models.descriptor import DEFAULT_MODEL, DescriptorModel, ModelError
 
 # An ONNX file that maps (1, 1, 64, 900) to itself.

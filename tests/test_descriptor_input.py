@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import yard
+
 from revisitd.models.preprocess import INPUT_SHAPE, N_COLUMNS, Resampler, row_elevation_rad
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from revisitd.models.metrics import (
     balanced_weights,
     calibration_curve,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import yard
+
 from revisitd.models.overlap import RangeView, overlap, overlap_matrix, view_of_scan
 
 

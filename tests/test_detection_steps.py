@@ -118,8 +118,8 @@ def wall_at(x, half_width=20.0):
     return points[ahead].astype(np.float32)
 
 
-def image(points, T=np.eye(4)):
-    return depth_image(points, T, ALTITUDES, 1024)
+def image(points, T=None):
+    return depth_image(points, np.eye(4) if T is None else T, ALTITUDES, 1024)
 
 
 def test_a_point_before_a_wall_is_looked_through_one_behind_it_is_unknown():

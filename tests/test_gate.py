@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from captures import COLUMNS, PERIOD_NS, START_NS, metadata, ranges_mm
+
 from revisitd.drivers.errors import BadCapture
 from revisitd.drivers.frame import Frame
 from revisitd.drivers.gate import FrameGate, Rejection

@@ -5,10 +5,11 @@ import threading
 
 import numpy as np
 import pytest
+from stored import SESSION, make_scan, pose
+
 from revisitd.storage.index import IndexStore
 from revisitd.storage.rows import InstanceRow
 from revisitd.storage.schema import CHANGES_MIGRATIONS, INDEX_MIGRATIONS
-from stored import SESSION, make_scan, pose
 
 UUID = "00000000-0000-0000-0000-000000000001"
 

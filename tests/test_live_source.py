@@ -10,6 +10,7 @@ from itertools import islice
 import numpy as np
 import pytest
 from captures import COLUMNS, INIT_ID, metadata, packets, ranges_mm
+
 from revisitd.drivers.errors import BadMetadata, SensorUnavailable
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.ouster import open_source

@@ -22,6 +22,7 @@ from captures import (
     write_capture,
 )
 from ouster.sdk import core, osf
+
 from revisitd.drivers.beside import match_metadata
 from revisitd.drivers.datagrams import Reassembler
 from revisitd.drivers.frame import Frame

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from ouster.sdk import core
+from stored import SESSION, make_change, make_scan, pose
+
 from revisitd.daemon import plot
 from revisitd.daemon.plotdata import gather
 from revisitd.storage.errors import DataDirError
 from revisitd.storage.store import Store
-from stored import SESSION, make_change, make_scan, pose
 
 SHAPE = (64, 512)
 GROUND_M, WALL_M = 1.0, 6.0  # the sensor's height; the radius of a round wall about it

@@ -6,9 +6,10 @@ import json
 
 import numpy as np
 import pytest
+from stored import make_change, pose
+
 from revisitd.daemon import report
 from revisitd.storage.changes import ChangeStore
-from stored import make_change, pose
 
 
 @pytest.fixture

@@ -5,10 +5,11 @@ import zlib
 
 import numpy as np
 import pytest
+from stored import make_scan
+
 from revisitd.storage import scanfile
 from revisitd.storage.errors import ScanFileError
 from revisitd.storage.scans import ScanStore
-from stored import make_scan
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ MAX_BORROW_M = 6.0  # a bin without a plane of its own uses the nearest one with
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Planes of the bins that have ground: mean (B, 3), normal (B, 3) upward, covariance (B, 3, 3), sigma (B,) metres."""
+    """Planes of the bins with ground: mean (B, 3), upward normal (B, 3), covariance (B, 3, 3), sigma (B,), metres."""
 
     mean: np.ndarray
     normal: np.ndarray

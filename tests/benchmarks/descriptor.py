@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
 from revisitd.models.descriptor import DescriptorModel
 from revisitd.models.metrics import descriptor_distances, pairs, rank_agreement, recall
 from revisitd.models.preprocess import N_COLUMNS
