@@ -22,6 +22,7 @@ from .odometry import Motion
 from .scenes import SceneUpdate
 from .sensors import Sensors
 from .session import Session
+from .views import OWN_BODY_M
 from .worker import DetectionWorker
 
 logger = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ class Pipeline:
         points = deskew(
             frame.sensor.points(frame.range_mm), column_phase(frame.column_ns, frame.column_valid), motion.T_start_end
         )
-        returns = points[(frame.range_mm > 0) & frame.column_valid]
+        returns = points[(frame.range_mm > OWN_BODY_M * 1e3) & frame.column_valid]
         scenes = session.scenes_to_align_with(motion.T_odom_sensor)
         fix = session.localizer.locate(returns, motion.T_odom_sensor, scenes)
         scan = self._scan(session, frame, motion, fix)

@@ -13,13 +13,14 @@ from .geometry import column_phase, deskew, fraction_of, inverse, transform
 
 # Depth images are taken from the middle of the sweep: half the parallax of either end.
 MID_SWEEP = 0.5
+OWN_BODY_M = 1.0  # returns nearer are the robot itself: they hide what is behind them, and are of no place
 
 
 def swept_points(scan: Scan, sensor: Sensor, phase: float) -> tuple[np.ndarray, np.ndarray]:
     """All pixels as seen at one phase of the sweep, (H, W, 3) float32 metres, sensor frame; which are returns."""
     columns = column_phase(scan.column_ns, scan.column_valid)
     points = deskew(sensor.points(scan.range_mm), columns, scan.T_start_end, phase)
-    return points, (scan.range_mm > 0) & scan.column_valid
+    return points, (scan.range_mm > OWN_BODY_M * 1e3) & scan.column_valid
 
 
 def map_points(scan: Scan, sensor: Sensor, range_m: float) -> np.ndarray:
