@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-pytest.importorskip("embreex", reason="needs the extra [sim]")
+pytest.importorskip("revisitd.drivers.virtual.embree", reason="needs the extra [sim]", exc_type=ImportError)
 
 from ouster.sdk import open_source
+
 from revisitd.drivers.ouster import sensor_from_metadata
 from revisitd.drivers.virtual import SCENARIOS, simulate
 from revisitd.drivers.virtual.packets import BOOT_NS, PROFILES, Encoder
@@ -113,7 +114,9 @@ def test_change_points_lie_where_the_packets_put_the_change(patrol):
         for index, frame in enumerate(frames_of(capture)):
             row, column = np.nonzero(labels[f"{index:06d}"] == change["object"])
             local = sensor.points(frame.field("RANGE"))[row, column]
-            pose = np.linalg.inv(T_world_map) @ world.patrol.pose((frame.timestamp[column].astype(int) - BOOT_NS) * 1e-9)
+            pose = np.linalg.inv(T_world_map) @ world.patrol.pose(
+                (frame.timestamp[column].astype(int) - BOOT_NS) * 1e-9
+            )
             found.append(np.einsum("kij,kj->ki", pose[:, :3, :3], local) + pose[:, :3, 3])
         found, points = np.concatenate(found), np.array(change["points"])
         assert change["n_visible_returns"] > 200 and len(points) > 50

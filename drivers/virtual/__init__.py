@@ -1,4 +1,4 @@
-"""A virtual OS1 in virtual worlds: captures with ground truth, for demos, trying settings, training and tests.
+"""A virtual OS1 in virtual worlds: captures with ground truth, for demos, settings, training and tests.
 
 Needs the extra [sim] (Embree).
 """

@@ -42,8 +42,14 @@ def building(rng: np.random.Generator, length: float, depth: float, height: floa
     skin = Material.BRICK if rng.random() < 0.6 else Material.CONCRETE
     recess = rng.uniform(0.12, 0.25)
     parts, doors = [], None
-    for side, (yaw, wide, far) in enumerate(((0, length, depth), (0.5 * np.pi, depth, length),
-                                             (np.pi, length, depth), (1.5 * np.pi, depth, length))):
+    for side, (yaw, wide, far) in enumerate(
+        (
+            (0, length, depth),
+            (0.5 * np.pi, depth, length),
+            (np.pi, length, depth),
+            (1.5 * np.pi, depth, length),
+        )
+    ):
         holes = _openings(rng, wide, height, with_door=side == 0)
         wall = _facade(holes, wide, height, skin, recess) + _trim(rng, wide, height, skin)
         place = dict(xyz=rotated((0, -far / 2), yaw), yaw=yaw)
@@ -73,7 +79,9 @@ def _openings(rng, wide: float, height: float, with_door: bool) -> list[Opening]
             if floor == 0 and bay == door_bay:
                 holes.append(Opening(x, 0.02, *DOOR_SIZE_M, is_door=True))
             elif rng.random() < 0.75:
-                holes.append(Opening(x, 2.9 * floor + 0.95, min(rng.uniform(0.9, 1.5), pitch - 0.8), rng.uniform(1.0, 1.4)))
+                holes.append(
+                    Opening(x, 2.9 * floor + 0.95, min(rng.uniform(0.9, 1.5), pitch - 0.8), rng.uniform(1.0, 1.4))
+                )
     return [hole for hole in holes if hole.z + hole.height < height - 0.15]
 
 
@@ -112,7 +120,9 @@ def _trim(rng, wide: float, height: float, skin: Material) -> list[Mesh]:
     pipe = rng.uniform(-0.48, 0.48) * wide
     parts.append(tube([[pipe, -0.08, -0.5], [pipe, -0.08, height]], [0.05, 0.05], Material.METAL, 6))
     if rng.random() < 0.6:
-        parts.append(box((0.7, 0.35, 0.6), Material.METAL, (rng.uniform(-0.4, 0.4) * wide, -0.2, rng.uniform(0.1, 2.2))))
+        parts.append(
+            box((0.7, 0.35, 0.6), Material.METAL, (rng.uniform(-0.4, 0.4) * wide, -0.2, rng.uniform(0.1, 2.2)))
+        )
     return parts
 
 
@@ -131,13 +141,15 @@ def _room(hole: Opening, recess: float) -> Mesh:
     x, w, d, h = hole.x, 1.3, 3.2, 2.5
     y = recess + 0.02
     left, right = x - w, x + w
-    corner = np.array([
-        [[left, y, 0], [right, y, 0], [right, y + d, 0], [left, y + d, 0]],
-        [[left, y, h], [right, y, h], [right, y + d, h], [left, y + d, h]],
-        [[left, y + d, 0], [right, y + d, 0], [right, y + d, h], [left, y + d, h]],
-        [[left, y, 0], [left, y + d, 0], [left, y + d, h], [left, y, h]],
-        [[right, y, 0], [right, y + d, 0], [right, y + d, h], [right, y, h]],
-    ])
+    corner = np.array(
+        [
+            [[left, y, 0], [right, y, 0], [right, y + d, 0], [left, y + d, 0]],
+            [[left, y, h], [right, y, h], [right, y + d, h], [left, y + d, h]],
+            [[left, y + d, 0], [right, y + d, 0], [right, y + d, h], [left, y + d, h]],
+            [[left, y, 0], [left, y + d, 0], [left, y + d, h], [left, y, h]],
+            [[right, y, 0], [right, y + d, 0], [right, y + d, h], [right, y, h]],
+        ]
+    )
     return merge([quads(corner, Material.CONCRETE), box((0.8, 0.5, 1.7), Material.WOOD, (x + 0.7, y + d - 0.4, 0))])
 
 
@@ -146,7 +158,14 @@ def _roof(rng, length: float, depth: float, height: float) -> list[Mesh]:
     if rng.random() < 0.65:
         x, y, top = length / 2 + 0.35, depth / 2 + 0.45, height + rng.uniform(0.25, 0.45) * depth
         slopes = [[[-x, s * y, height - 0.1], [x, s * y, height - 0.1], [x, 0, top], [-x, 0, top]] for s in (-1, 1)]
-        gables = [[[s * length / 2, -depth / 2, height], [s * length / 2, depth / 2, height], [s * length / 2, 0, top - 0.1]] for s in (-1, 1)]
+        gables = [
+            [
+                [s * length / 2, -depth / 2, height],
+                [s * length / 2, depth / 2, height],
+                [s * length / 2, 0, top - 0.1],
+            ]
+            for s in (-1, 1)
+        ]
         chimney = box((0.6, 0.6, 1.6), Material.BRICK, (rng.uniform(-0.3, 0.3) * length, 0.5, top - 0.8))
         return [quads(slopes, Material.BRICK), triangles(gables, Material.BRICK), chimney]
     edge = [box((length + 0.2, 0.2, 0.5), Material.CONCRETE, (0, s * depth / 2, height)) for s in (-1, 1)]

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from .packets import PROFILES, Encoder
 from .pcap import FILE_HEADER
 from .scenarios import SCENARIOS, Scenario
@@ -32,15 +34,24 @@ class Capture:
 
 
 def simulate(
-    out_dir: Path, scenario: str | Scenario = "short", seed: int = 0, beams: int = 128, columns: int = 1024,
-    rate_hz: int = 10, profile: str = PROFILES[0], passes: int | None = None, length_m: float | None = None,
-    max_s: float | None = None, workers: int = 2, progress: Callable[[int, int], None] | None = None,
+    out_dir: Path,
+    scenario: str | Scenario = "short",
+    seed: int = 0,
+    beams: int = 128,
+    columns: int = 1024,
+    rate_hz: int = 10,
+    profile: str = PROFILES[0],
+    passes: int | None = None,
+    length_m: float | None = None,
+    max_s: float | None = None,
+    workers: int = 2,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Capture:
     """Drives a patrol and writes capture.pcap, capture.json and truth/ into out_dir.
 
-    scenario: a name of SCENARIOS, or one of your own; passes, length_m (of the route) override it; max_s cuts the
-    patrol short. workers: processes that cast; the bytes written do not depend on it. progress: called with (frames
-    done, frames in all). Raises ValueError for unknown names and for sensors that do not exist.
+    scenario: a name of SCENARIOS, or one of your own; passes and length_m (of the route) override it; max_s
+    cuts the patrol short. workers: processes that cast; the bytes written do not depend on it. progress: called
+    with (frames done, frames in all). Raises ValueError for unknown names and for sensors that do not exist.
     """
     plan = _plan(scenario, passes, length_m)
     if profile not in PROFILES:
@@ -51,13 +62,8 @@ def simulate(
     capture = Capture(out_dir / "capture.pcap", out_dir / "capture.json", out_dir / "truth")
     capture.metadata.write_text(metadata)
     world = build_world(plan, seed)
-    seconds = min(world.patrol.duration_s, max_s or world.patrol.duration_s)
-    total = max(1, int(seconds * 1e9) // Encoder(metadata).period_ns)
-    bounds = [total * k // workers for k in range(workers + 1)]
-    jobs = [
-        Job(plan, seed, metadata, first, stop, capture.pcap.with_suffix(f".part{k}"))
-        for k, (first, stop) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)) if first < stop
-    ]
+    total = max(1, int(min(world.patrol.duration_s, max_s or np.inf) * 1e9) // Encoder(metadata).period_ns)
+    jobs = _jobs(Job(plan, seed, metadata, 0, total, capture.pcap), workers)
     truth = Truth(capture.truth, world)
     try:
         for done, shot in enumerate(_shots(jobs, world), 1):
@@ -80,6 +86,16 @@ def _plan(scenario: str | Scenario, passes: int | None, length_m: float | None) 
     if passes:
         scenario = replace(scenario, passes=passes)
     return replace(scenario, length_m=(length_m, length_m)) if length_m else scenario
+
+
+def _jobs(whole: Job, count: int) -> list[Job]:
+    """One job cut into at most `count`, each with a part of its own."""
+    bounds = [whole.stop * k // count for k in range(count + 1)]
+    return [
+        replace(whole, first=first, stop=stop, part=whole.part.with_suffix(f".part{k}"))
+        for k, (first, stop) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
+        if first < stop
+    ]
 
 
 def _shots(jobs: list[Job], world: World) -> Iterator[Shot]:
@@ -109,8 +125,8 @@ def _shots(jobs: list[Job], world: World) -> Iterator[Shot]:
 
 
 def _start(job: Job) -> subprocess.Popen:
-    # A plain process rather than multiprocessing: it needs neither a fork beside running threads nor an importable
-    # __main__, so that simulate() also works from a notebook or a script without a guard.
+    # A plain process rather than multiprocessing: it needs neither a fork beside running threads nor an
+    # importable __main__, so that simulate() also works from a notebook or a script without a guard.
     command = [sys.executable, "-c", f"from {__package__}.worker import main; main()"]
     # Small matrix products: more threads of BLAS than processes only wait for each other.
     alone = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}

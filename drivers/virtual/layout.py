@@ -35,7 +35,7 @@ class Layout:
         return bool(far) and self.site.is_free(points, also_view)
 
     def beside(self, near_m: float, far_m: float) -> tuple[np.ndarray, float, float]:
-        """A random place near_m .. far_m beyond the road's edge -> xy, heading of the route there, side (-1, 1)."""
+        """A random place near_m .. far_m beyond the road -> xy, the route's heading there, side (-1, 1)."""
         s, side = self.rng.uniform(0, self.route.length_m), self.rng.choice([-1.0, 1.0])
         lateral = self.edge_m + self.rng.uniform(near_m, far_m)
         return self.route.beside(s, side * lateral), float(self.route.at(s)[1]), side
@@ -52,7 +52,7 @@ class Layout:
 
 
 def houses(lay: Layout) -> list[tuple[Building, np.ndarray, float]]:
-    """Houses whose doors face the route, and others farther out -> [(building, xyz, yaw)] of the near ones."""
+    """Houses whose doors face the route, and others far off -> [(building, xyz, yaw)] of the near ones."""
     near = []
 
     def facing(smallest=5.0, largest=15.0, reach=(1.0, 12.0)):
@@ -91,11 +91,20 @@ def furnish(lay: Layout) -> None:
     lay.many(9 * stretch, lambda: _fence(lay))
     lay.many(7 * stretch, lambda: _long(lay, "hedge", shapes.hedge, 0.8, (2.0, 7.0)))
     lay.many(5 * stretch, lambda: _long(lay, "wall", shapes.wall, 0.4, (2.5, 8.0)))
-    lay.many(0.8 * stretch, lambda: _long(lay, "container", lambda rng, _: shapes.container(rng), 2.5, (6.06, 6.07)))
+    lay.many(
+        0.8 * stretch,
+        lambda: _long(lay, "container", lambda rng, _: shapes.container(rng), 2.5, (6.06, 6.07)),
+    )
     for shape, count, reach in (
-        (shapes.lamp, 5, (0.1, 1.0)), (shapes.pole, 5, (0.0, 6.0)), (shapes.bench, 3, (0.5, 5.0)),
-        (shapes.bin_, 4, (0.1, 6.0)), (shapes.bollard, 5, (0.0, 1.5)), (shapes.crate, 3, (0.5, 8.0)),
-        (shapes.rock, 5, (0.5, 15.0)), (shapes.cone, 2, (0.0, 3.0)), (shapes.person, 1.5, (0.5, 9.0)),
+        (shapes.lamp, 5, (0.1, 1.0)),
+        (shapes.pole, 5, (0.0, 6.0)),
+        (shapes.bench, 3, (0.5, 5.0)),
+        (shapes.bin_, 4, (0.1, 6.0)),
+        (shapes.bollard, 5, (0.0, 1.5)),
+        (shapes.crate, 3, (0.5, 8.0)),
+        (shapes.rock, 5, (0.5, 15.0)),
+        (shapes.cone, 2, (0.0, 3.0)),
+        (shapes.person, 1.5, (0.5, 9.0)),
     ):
         lay.many(count * stretch + 0.5, lambda shape=shape, reach=reach: _small(lay, shape, reach))
     lay.many(30 * stretch + 6, lambda: _tree(lay, lay.beside(0.8, 22.0)[0]))
@@ -136,7 +145,10 @@ def standing_car(lay: Layout, mesh: Mesh, xy, yaw: float) -> Mesh:
 
 def _fence(lay: Layout) -> None:
     xy, heading, _ = lay.beside(0.6, 12.0)
-    count, yaw = int(lay.rng.integers(3, 9)), heading + lay.rng.choice([0.0, 0.0, np.pi / 2]) + lay.rng.normal(0, 0.04)
+    count, yaw = (
+        int(lay.rng.integers(3, 9)),
+        heading + lay.rng.choice([0.0, 0.0, np.pi / 2]) + lay.rng.normal(0, 0.04),
+    )
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
     posts = xy + 2.0 * np.arange(count)[:, None] * ahead
     spot = rectangle((posts[0] + posts[-1]) / 2, yaw, 2.0 * (count - 1), 0.2)

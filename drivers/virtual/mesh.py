@@ -35,7 +35,7 @@ class Mesh:
     material: np.ndarray  # (M,) uint8
 
     def moved(self, xyz=(0.0, 0.0, 0.0), yaw=0.0, pitch=0.0, roll=0.0, scale=1.0) -> "Mesh":
-        """Scaled, then rotated (radians: roll about x, pitch about y, yaw about z), then shifted by xyz (metres)."""
+        """Scaled, then turned (radians; roll about x, pitch about y, yaw about z), then shifted by xyz."""
         turned = self.vertices * np.asarray(scale, np.float32) @ rotation(yaw, pitch, roll).T
         return replace(self, vertices=(turned + np.asarray(xyz)).astype(np.float32))
 
@@ -87,7 +87,7 @@ def quads(corners, material: Material) -> Mesh:
 
 
 def box(size, material: Material, base=(0.0, 0.0, 0.0), taper: float = 1.0) -> Mesh:
-    """A box of size (x, y, z) standing on base (the centre of its foot); its top is `taper` as wide as its foot."""
+    """A box of size (x, y, z) standing on base (the centre of its foot); its top is `taper` as wide."""
     x, y, z = size
     corner = np.array([[i, j, k] for k in (0, 1) for j in (-0.5, 0.5) for i in (-0.5, 0.5)])
     corner[4:, :2] *= taper
@@ -96,7 +96,7 @@ def box(size, material: Material, base=(0.0, 0.0, 0.0), taper: float = 1.0) -> M
 
 
 def loft(rings, material: Material, closed: bool = True) -> Mesh:
-    """rings: (K, P, 3) metres, K outlines of P points each -> the surface between them; closed joins last to first."""
+    """rings: (K, P, 3) metres, K outlines of P points -> the surface between; closed joins last to first."""
     rings = np.asarray(rings, np.float32)
     count, points = rings.shape[:2]
     index = np.arange(count * points, dtype=np.int32).reshape(count, points)
@@ -128,7 +128,11 @@ def ellipsoid(radii, material: Material, centre=(0.0, 0.0, 0.0), sides: int = 10
     latitude = np.linspace(-np.pi / 2, np.pi / 2, max(5, sides // 2 + 1))[:, None]
     longitude = 2 * np.pi * np.arange(sides)[None] / sides
     ball = np.stack(
-        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude) + 0 * longitude],
+        [
+            np.cos(latitude) * np.cos(longitude),
+            np.cos(latitude) * np.sin(longitude),
+            np.sin(latitude) + 0 * longitude,
+        ],
         -1,
     )
     return loft(ball * np.asarray(radii) + np.asarray(centre), material)

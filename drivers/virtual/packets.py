@@ -11,7 +11,11 @@ MASKS = {  # bits of a field that a profile carries, where they are fewer than t
     "RNG15_RFL8_NIR8_DUAL": {"RANGE": 0x3FFF8, "NEAR_IR": 0xFF0},
 }
 PROFILES = (
-    "RNG19_RFL8_SIG16_NIR16", "RNG15_RFL8_NIR8", "RNG19_RFL8_SIG16_NIR16_DUAL", "RNG15_RFL8_NIR8_DUAL", "LEGACY",
+    "RNG19_RFL8_SIG16_NIR16",
+    "RNG15_RFL8_NIR8",
+    "RNG19_RFL8_SIG16_NIR16_DUAL",
+    "RNG15_RFL8_NIR8_DUAL",
+    "LEGACY",
 )
 
 

@@ -28,7 +28,14 @@ class Pass:
 class Patrol:
     """Passes driven one after another; `pose` is smooth but for the shake of a rolling vehicle."""
 
-    def __init__(self, route: Route, terrain: Terrain, passes: list[Pass], rng: np.random.Generator, height_m: float = 1.2):
+    def __init__(
+        self,
+        route: Route,
+        terrain: Terrain,
+        passes: list[Pass],
+        rng: np.random.Generator,
+        height_m: float = 1.2,
+    ):
         self._route, self._terrain, self._sensor_height = route, terrain, height_m
         self.passes = passes
         self._t, self._along, self._offset, self._face, self.pass_start_s = _drive(route, passes, rng)
@@ -72,7 +79,7 @@ class Patrol:
 
 
 def _drive(route: Route, passes: list[Pass], rng):
-    """Tables over time: t, metres along, lateral offset, heading relative to the route; and when each pass starts."""
+    """Tables over time: t, metres along, lateral offset, heading off the route's; when each pass starts."""
     along = route.length_m if passes[0].reverse else 0.0
     face = np.pi if passes[0].reverse else 0.0
     rows, starts = [_hold(0.0, REST_S, along, passes[0].offset_m, face)], [0.0]

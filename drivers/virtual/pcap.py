@@ -1,7 +1,7 @@
 """UDP packets -> pcap records, as a capture tool would have stored them: Ethernet, IPv4 in fragments, UDP.
 
-Our own, since the SDK's recorder numbers its IP packets by a counter of the process: equal frames would give other
-bytes each time.
+Our own, since the SDK's recorder numbers its IP packets by a counter of the process: equal frames would give
+other bytes each time.
 """
 
 import struct
@@ -28,18 +28,18 @@ class Records:
         self._heads = [np.frombuffer(head, np.uint8) for head in heads]
 
     def __call__(self, packets: np.ndarray, host_ns: np.ndarray, first_number: int) -> bytes:
-        """packets: (N, size) uint8, host_ns: (N,) int64, first_number: how many packets came before -> N records."""
+        """packets: (N, size) uint8, host_ns: (N,) int64, first_number: packets before these -> N records."""
         number = (first_number + np.arange(len(packets))) % 65536
         clock = np.stack([host_ns // 10**9, host_ns % 10**9 // 1000], 1).astype("<u4").view(np.uint8)
         pieces = []
         for start, size, head in zip(self._starts, self._sizes, self._heads, strict=True):
             top = np.repeat(head[None], len(packets), 0)
             top[:, :8] = clock
-            ip = top[:, RECORD_BYTES + ETHERNET_BYTES:HEAD_BYTES]
+            ip = top[:, RECORD_BYTES + ETHERNET_BYTES : HEAD_BYTES]
             ip[:, 4:6] = number[:, None] >> [8, 0] & 255
             ip[:, 10:12] = _checksum(ip)[:, None] >> [8, 0] & 255
             first = max(0, start - UDP_BYTES)
-            pieces += [top, packets[:, first:start - UDP_BYTES + size]]
+            pieces += [top, packets[:, first : start - UDP_BYTES + size]]
         return np.concatenate(pieces, axis=1).tobytes()
 
 

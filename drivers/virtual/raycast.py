@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore import EmbreeDevice
-from embreex.rtcore_scene import EmbreeScene
 
 from ..frame import Sensor
+from .embree import Solid
 from .mesh import Material, Mesh, merge, rotation
 from .shapes import vehicle
 from .worlds import World
@@ -52,7 +50,8 @@ class Caster:
         first = len(world.items) + 1
         self._movers = [
             (first + k, mover, [Solid(mesh) for mesh in mover.meshes])
-            for k, mover in enumerate(world.movers) if mover.pass_index == pass_index
+            for k, mover in enumerate(world.movers)
+            if mover.pass_index == pass_index
         ]
         self._vehicle = Solid(vehicle()) if with_vehicle else None
         self._vehicle_id = world.kinds.index("vehicle")
@@ -76,7 +75,12 @@ class Caster:
                 self._add_mover(met, number, mover, scenes, origin, ray, np.asarray(t_s, float))
         if self._vehicle:
             own = (np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(-1, 3) for a in (sensor.offset, sensor.direction))
-            met.nearer(np.arange(len(ray)), self._vehicle.hit(*own, met.range_m), self._vehicle_id, self._vehicle.material)
+            met.nearer(
+                np.arange(len(ray)),
+                self._vehicle.hit(*own, met.range_m),
+                self._vehicle_id,
+                self._vehicle.material,
+            )
         met.range_m[met.object_id == 0] = np.inf
         return Hits(*(np.ascontiguousarray(a.reshape(width, height).T) for a in vars(met).values()))
 
@@ -100,7 +104,7 @@ class Caster:
             met.clarity[which] *= clarity
 
     def _second_leg(self, origin, ray, face, range_m, normal, cosine):
-        """Where the beam goes on from a pane (straight) or a puddle (mirrored) -> start, direction, light left."""
+        """How beams go on from a pane (straight) or puddle (mirrored) -> start, direction, light left."""
         water = self._static.material[face] == Material.WATER
         mirrored = ray - 2 * np.einsum("ni,ni->n", ray, normal)[:, None] * normal
         onward = np.where(water[:, None], mirrored, ray).astype(np.float32)
@@ -109,7 +113,7 @@ class Caster:
         return start, onward, np.where(water, mirror, PANE_CLARITY).astype(np.float32)
 
     def _add_mover(self, met: "_Met", number, mover, scenes, origin, ray, t_s) -> None:
-        """Overwrites what was met where the mover is nearer; the mover, too, moves on from column to column."""
+        """Overwrites what was met where the mover is nearer; it, too, moves on from column to column."""
         middle, height = len(t_s) // 2, len(ray) // len(t_s)
         xy, yaw = mover.place(t_s)
         z = float(self._terrain.height(xy[middle]))
@@ -125,37 +129,6 @@ class Caster:
         met.nearer(near, scene.hit(local, heading, met.range_m[near]), number, scene.material)
 
 
-class Solid:
-    """One mesh in Embree."""
-
-    def __init__(self, mesh: Mesh):
-        self._device = EmbreeDevice()  # the scene does not keep it alive
-        self._scene = EmbreeScene(self._device)
-        self._mesh = TriangleMesh(self._scene, mesh.vertices, mesh.faces)
-        self.material = mesh.material
-        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-        self._middle, self._radius_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-
-    def hit(self, origin: np.ndarray, ray: np.ndarray, limit_m: np.ndarray):
-        """(N, 3), (N, 3), (N,) float32 -> face (N,) int32 (-1: none), range (N,) float32, unit normal (N, 3), |cos|."""
-        if not len(ray):
-            return np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-        found = self._scene.run(*(np.ascontiguousarray(a, np.float32) for a in (origin, ray)),
-                                dists=limit_m.astype(np.float32), output=True)
-        normal = found["Ng"]
-        normal /= np.maximum(np.sqrt(np.einsum("ni,ni->n", normal, normal)), np.float32(1e-12))[:, None]
-        return found["primID"], found["tfar"], normal, np.abs(np.einsum("ni,ni->n", normal, ray))
-
-    def in_view(self, origin: np.ndarray, ray: np.ndarray, shift=(0.0, 0.0, 0.0), slack_m: float = 0.3) -> np.ndarray:
-        """Indices of the rays that may meet the mesh when it is moved by `shift`; origins lie close together."""
-        centre = self._middle + shift - origin[len(origin) // 2]
-        distance, reach = np.linalg.norm(centre), self._radius_m + slack_m
-        if distance <= reach:
-            return np.arange(len(ray))
-        cosine = np.sqrt(1 - (reach / distance) ** 2)
-        return np.flatnonzero(ray @ (centre / distance).astype(np.float32) > cosine)
-
-
 @dataclass(eq=False)
 class _Met:
     """What each ray has met so far, nearest first; the fields of Hits, flat and writable."""
@@ -168,7 +141,11 @@ class _Met:
 
     @classmethod
     def nothing(cls, n: int) -> "_Met":
-        far, dark, clear = np.full(n, MAX_RANGE_M, np.float32), np.zeros(n, np.float32), np.ones(n, np.float32)
+        far, dark, clear = (
+            np.full(n, MAX_RANGE_M, np.float32),
+            np.zeros(n, np.float32),
+            np.ones(n, np.float32),
+        )
         return cls(far, np.zeros(n, np.uint16), np.zeros(n, np.uint8), dark, clear)
 
     def nearer(self, which: np.ndarray, found, object_id, material: np.ndarray) -> None:
@@ -185,7 +162,7 @@ class _Met:
 
 
 def rays(sensor: Sensor, T_world_sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and direction (W * H, 3) float32 of each beam, world frame, from one pose or from one for each column.
+    """Origin and direction (W * H, 3) float32 of each beam, world frame; one pose or one for each column.
 
     Column by column, so that neighbours in memory are neighbours in space.
     """

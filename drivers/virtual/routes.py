@@ -17,13 +17,17 @@ class Route:
         self._s = np.linspace(0, self.length_m, int(self.length_m / STEP_M) + 1)
         self._ring = np.stack([np.interp(self._s, s, ring[:, k]) for k in (0, 1)], 1)
         self.xy = self._ring[:-1] if closed else self._ring  # (M, 2) metres, every STEP_M
-        step = np.roll(self._ring[:-1], -1, 0) - np.roll(self._ring[:-1], 1, 0) if closed else np.gradient(self._ring, axis=0)
+        step = (
+            np.roll(self._ring[:-1], -1, 0) - np.roll(self._ring[:-1], 1, 0)
+            if closed
+            else np.gradient(self._ring, axis=0)
+        )
         yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
         self._turn = 2 * np.pi * np.round((yaw[-1] - yaw[0]) / (2 * np.pi)) if closed else 0.0
         self._yaw = np.append(yaw, yaw[0] + self._turn) if closed else yaw
 
     def at(self, s) -> tuple[np.ndarray, np.ndarray]:
-        """s: (...) metres along the route (wrapped on a loop) -> xy (..., 2), heading (...) rad, continuous over laps."""
+        """s: (...) metres along (a loop wraps) -> xy (..., 2), heading (...) rad, continuous over laps."""
         s = np.asarray(s, float)
         lap = np.floor(s / self.length_m) if self.closed else 0.0
         s = s - lap * self.length_m

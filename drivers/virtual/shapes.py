@@ -1,4 +1,4 @@
-"""Things found outdoors, as meshes standing on the origin. Each takes a generator and differs a little every time."""
+"""Things found outdoors, as meshes standing on the origin; each differs a little every time."""
 
 import numpy as np
 
@@ -13,14 +13,28 @@ def person(rng: Rng, stride: float = 0.0) -> Mesh:
     k, girth = height / 1.75, rng.uniform(0.85, 1.2)
     swing = 0.32 * stride
     parts = [ellipsoid((0.095, 0.08, 0.125), Material.CLOTH, (0.02, 0, 1.62))]
-    parts.append(tube([[0, 0, 0.88], [0, 0, 1.15], [0, 0, 1.42], [0, 0, 1.54]], [0.15, 0.14, 0.17, 0.06], Material.CLOTH))
+    parts.append(
+        tube([[0, 0, 0.88], [0, 0, 1.15], [0, 0, 1.42], [0, 0, 1.54]], [0.15, 0.14, 0.17, 0.06], Material.CLOTH)
+    )
     for side in (-1, 1):
         foot = side * swing
         knee = [0.5 * foot + 0.03, side * 0.1, 0.48]
-        parts.append(tube([[0, side * 0.09, 0.92], knee, [foot, side * 0.11, 0.08]], [0.085, 0.065, 0.05], Material.CLOTH))
+        parts.append(
+            tube(
+                [[0, side * 0.09, 0.92], knee, [foot, side * 0.11, 0.08]],
+                [0.085, 0.065, 0.05],
+                Material.CLOTH,
+            )
+        )
         parts.append(box((0.27, 0.1, 0.08), Material.RUBBER, (foot + 0.06, side * 0.11, 0)))
         hand = [-0.9 * foot + 0.08, side * 0.27, 0.84]
-        parts.append(tube([[0, side * 0.2, 1.42], [-0.4 * foot, side * 0.26, 1.12], hand], [0.055, 0.045, 0.035], Material.CLOTH))
+        parts.append(
+            tube(
+                [[0, side * 0.2, 1.42], [-0.4 * foot, side * 0.26, 1.12], hand],
+                [0.055, 0.045, 0.035],
+                Material.CLOTH,
+            )
+        )
     return merge(parts).moved(scale=(k * girth, k * girth, k))
 
 
@@ -62,7 +76,10 @@ def bench(rng: Rng) -> Mesh:
     seat = [box((length, 0.1, 0.035), Material.WOOD, (0, y, 0.44)) for y in (-0.14, 0.0, 0.14)]
     back = [box((length, 0.03, 0.1), Material.WOOD, (0, -0.24 - 0.05 * k, 0.58 + 0.16 * k)) for k in (0, 1)]
     legs = [box((0.06, 0.42, 0.44), Material.METAL, (x * length * 0.42, 0, 0)) for x in (-1, 1)]
-    posts = [tube([[x * length * 0.42, -0.2, 0.4], [x * length * 0.42, -0.31, 0.86]], [0.03] * 2, Material.METAL) for x in (-1, 1)]
+    posts = [
+        tube([[x * length * 0.42, -0.2, 0.4], [x * length * 0.42, -0.31, 0.86]], [0.03] * 2, Material.METAL)
+        for x in (-1, 1)
+    ]
     return merge(seat + back + legs + posts)
 
 
@@ -101,12 +118,18 @@ def fence_panel(rng: Rng, length: float = 2.2) -> Mesh:
 def fence(rng: Rng, heights: np.ndarray, step: float = 2.0) -> Mesh:
     """A picket or board fence along +x; heights: (K,) ground height at each post, `step` metres apart."""
     solid, h = rng.random() < 0.4, rng.uniform(0.9, 1.6)
-    posts = [tube([[k * step, 0, z - 0.3], [k * step, 0, z + h]], [0.05] * 2, Material.WOOD, 6) for k, z in enumerate(heights)]
+    posts = [
+        tube([[k * step, 0, z - 0.3], [k * step, 0, z + h]], [0.05] * 2, Material.WOOD, 6)
+        for k, z in enumerate(heights)
+    ]
     parts, width = posts, 1.0 if solid else rng.uniform(0.45, 0.6)
     for k, (z0, z1) in enumerate(zip(heights[:-1], heights[1:], strict=True)):
         x = k * step + step * np.arange(0.0, 0.999, 0.075)
         z, w = z0 + (z1 - z0) * (x - k * step) / step, 0.075 * step * width
-        corner = np.stack([np.stack([x + a * w, 0 * x + 0.04, z + b], -1) for a, b in ((0, 0.05), (1, 0.05), (1, h), (0, h))], 1)
+        corner = np.stack(
+            [np.stack([x + a * w, 0 * x + 0.04, z + b], -1) for a, b in ((0, 0.05), (1, 0.05), (1, h), (0, h))],
+            1,
+        )
         parts.append(quads(corner, Material.WOOD))
     return merge(parts)
 
@@ -114,7 +137,12 @@ def fence(rng: Rng, heights: np.ndarray, step: float = 2.0) -> Mesh:
 def wall(rng: Rng, length: float) -> Mesh:
     """A low garden wall along x with a coping."""
     h = rng.uniform(0.5, 1.3)
-    return merge([box((length, 0.3, h + 0.5), Material.BRICK, (0, 0, -0.5)), box((length, 0.4, 0.08), Material.CONCRETE, (0, 0, h))])
+    return merge(
+        [
+            box((length, 0.3, h + 0.5), Material.BRICK, (0, 0, -0.5)),
+            box((length, 0.4, 0.08), Material.CONCRETE, (0, 0, h)),
+        ]
+    )
 
 
 def container(rng: Rng) -> Mesh:
@@ -122,9 +150,17 @@ def container(rng: Rng) -> Mesh:
     x = np.linspace(-3.03, 3.03, 81)
     depth = 1.22 - 0.035 * ((np.arange(81) // 2) % 2)
     sides = [np.stack([[a, s * d, z] for a, d in zip(x, depth, strict=True)]) for s in (-1, 1) for z in (0.1, 2.55)]
-    walls = [quads(np.stack([lo[:-1], lo[1:], hi[1:], hi[:-1]], 1), Material.PAINT) for lo, hi in (sides[:2], sides[2:])]
-    return merge([*walls, box((6.06, 2.44, 0.1), Material.METAL), box((6.06, 2.44, 0.05), Material.PAINT, (0, 0, 2.55)),
-                  *(box((0.06, 2.44, 2.5), Material.PAINT, (s * 3.0, 0, 0.08)) for s in (-1, 1))])
+    walls = [
+        quads(np.stack([lo[:-1], lo[1:], hi[1:], hi[:-1]], 1), Material.PAINT) for lo, hi in (sides[:2], sides[2:])
+    ]
+    return merge(
+        [
+            *walls,
+            box((6.06, 2.44, 0.1), Material.METAL),
+            box((6.06, 2.44, 0.05), Material.PAINT, (0, 0, 2.55)),
+            *(box((0.06, 2.44, 2.5), Material.PAINT, (s * 3.0, 0, 0.08)) for s in (-1, 1)),
+        ]
+    )
 
 
 def rock(rng: Rng) -> Mesh:
@@ -144,7 +180,14 @@ def tree(rng: Rng, n_leaves: int = 1500, tall: float = 1.0) -> Mesh:
         start = trunk[2] + (trunk[3] - trunk[2]) * rng.uniform(0, 1)
         out = h * rng.uniform(0.16, 0.32)
         tip = start + [out * np.cos(angle), out * np.sin(angle), h * rng.uniform(0.1, 0.25)]
-        parts.append(tube([start, 0.5 * (start + tip) - [0, 0, 0.05 * out], tip], [r * 0.4, r * 0.3, r * 0.12], Material.WOOD, 6))
+        parts.append(
+            tube(
+                [start, 0.5 * (start + tip) - [0, 0, 0.05 * out], tip],
+                [r * 0.4, r * 0.3, r * 0.12],
+                Material.WOOD,
+                6,
+            )
+        )
         tips.append(tip)
     tips = np.array(tips)
     pick = rng.integers(0, len(tips), n_leaves)
@@ -218,8 +261,8 @@ def puddle(rng: Rng, height) -> Mesh:
 
 
 def vehicle() -> Mesh:
-    """What a sensor on a mast sees of the robot below and behind it: deck, box, two antennas. Sensor frame."""
-    deck = box((1.35, 0.7, 0.05), Material.METAL, (-0.45, 0, -0.42))
-    case = box((0.3, 0.4, 0.26), Material.PLASTIC, (-0.85, 0, -0.37))
+    """What a sensor on a mast sees of the robot below and behind: deck, box, two antennas. Sensor frame."""
+    deck = box((1.2, 0.7, 0.05), Material.METAL, (-0.35, 0, -0.42))
+    case = box((0.25, 0.36, 0.24), Material.PLASTIC, (-0.8, 0, -0.37))
     whips = [tube([[-0.65, y, -0.4], [-0.65, y, 0.3]], [0.012, 0.008], Material.PLASTIC, 6) for y in (-0.32, 0.32)]
     return merge([deck, case, *whips])

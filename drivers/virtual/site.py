@@ -6,7 +6,7 @@ CELL_M = 0.4
 
 
 class Site:
-    """Occupancy of the ground, world frame. Points are (K, 2) metres; what lies outside the world counts as taken."""
+    """Occupancy of the ground, world frame. Points are (K, 2) metres; outside the world all is taken."""
 
     def __init__(self, bounds: np.ndarray):
         """bounds: (2, 2) metres, two opposite corners."""

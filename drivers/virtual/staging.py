@@ -70,14 +70,17 @@ class Mover:
 
 
 def stage(lay: Layout, houses: list, scenario: Scenario, n_passes: int) -> tuple[list[Stage], list]:
-    """Places the scenario's changes where the route sees them -> (stages, the houses that no change has touched).
+    """Places the scenario's changes where the route sees them -> (stages, the houses that no change needs).
 
     Spreads them along the route, away from its start. Raises ValueError where the world has no room.
     """
     wanted = [s for s in scenario.staged if s.first < n_passes]
     spare = list(houses)
     # House doors first: they need the few houses that suit; then large things.
-    order = sorted(wanted, key=lambda s: -{"house_door": 9.0, "car": 3.0, "car_door": 3.0}.get(s.kind, THINGS.get(s.kind, (0, 0))[1]))
+    order = sorted(
+        wanted,
+        key=lambda s: -{"house_door": 9.0, "car": 3.0, "car_door": 3.0}.get(s.kind, THINGS.get(s.kind, (0, 0))[1]),
+    )
     stages, taken_s = [], []
     for one in order:
         last = one.last if one.last is not None and one.last < n_passes - 1 else None
@@ -89,7 +92,7 @@ def stage(lay: Layout, houses: list, scenario: Scenario, n_passes: int) -> tuple
 def _spot(lay: Layout, taken_s: list, attempt: int) -> float:
     """A place along the route, away from its start and (at first) from the other changes."""
     length = lay.route.length_m
-    apart = 0.6 * length / (len(taken_s) + 3) * 0.98 ** attempt
+    apart = 0.6 * length / (len(taken_s) + 3) * 0.98**attempt
     keep = min(14.0, 0.15 * length)
     for _ in range(50):
         s = lay.rng.uniform(keep, length - keep)
@@ -199,7 +202,9 @@ def _walker(lay: Layout, patrol: Patrol, pass_index: int) -> Mover | None:
     meshes = None
     for _ in range(60):
         path = _walk_along(lay) if rng.random() < 0.6 else _walk_across(lay)
-        if path is None or not lay.site.is_free(np.concatenate([path.xy + d for d in ((0.3, 0), (-0.3, 0), (0, 0.3), (0, -0.3))]), also_view=False):
+        if path is None or not lay.site.is_free(
+            np.concatenate([path.xy + d for d in ((0.3, 0), (-0.3, 0), (0, 0.3), (0, -0.3))]), also_view=False
+        ):
             continue
         if meshes is None:
             body = int(rng.integers(1 << 30))

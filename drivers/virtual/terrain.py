@@ -31,7 +31,7 @@ class Terrain:
         self._bumps = rng.normal(0, 1.0, (512, 512))
 
     def to_road(self, xy) -> np.ndarray:
-        """xy: (..., 2) -> (...) distance from the road's centre line, metres (2 cm or better beside the road)."""
+        """xy: (..., 2) -> (...) metres from the road's centre line (to 2 cm or better beside the road)."""
         xy = np.asarray(xy, float)
         cell = np.clip(((xy - self.bounds[0]) / CELL_M).astype(int), 0, np.array(self._nearest.shape) - 1)
         gap = xy - self._route.xy[self._nearest[cell[..., 0], cell[..., 1]]]
@@ -57,7 +57,12 @@ class Terrain:
         xy = np.stack(np.meshgrid(xs, ys, indexing="ij"), -1)
         vertices = np.concatenate([xy, self.height(xy)[..., None]], -1).reshape(-1, 3).astype(np.float32)
         index = np.arange(len(vertices), dtype=np.int32).reshape(xy.shape[:2])
-        a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+        a, b, c, d = (
+            index[:-1, :-1].ravel(),
+            index[1:, :-1].ravel(),
+            index[1:, 1:].ravel(),
+            index[:-1, 1:].ravel(),
+        )
         faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
         on_road = self.to_road(vertices[faces[:, 0], :2]) < self.road_half_m
         return Mesh(vertices, faces, np.where(on_road, Material.ASPHALT, Material.SOIL).astype(np.uint8))
@@ -79,7 +84,9 @@ class Terrain:
         rails = [(face, foot - 0.1), (face, foot + self.kerb_m), (back, foot + self.kerb_m + 0.005)]
         rails = [np.concatenate([at, z[:, None]], 1) for at, z in rails]
         keep = (self.to_road(face) > self.road_half_m - 0.1)[:-1]
-        pieces = [np.stack([lo[:-1], lo[1:], hi[1:], hi[:-1]], 1)[keep] for lo, hi in zip(rails[:-1], rails[1:], strict=True)]
+        pieces = [
+            np.stack([lo[:-1], lo[1:], hi[1:], hi[:-1]], 1)[keep] for lo, hi in zip(rails[:-1], rails[1:], strict=True)
+        ]
         return np.concatenate(pieces)
 
     def _bump(self, xy: np.ndarray) -> np.ndarray:

@@ -18,12 +18,14 @@ class Truth:
     """Collects frame by frame; `write` finishes. Map frame = the sensor's pose at the end of frame 0.
 
     poses.txt: TUM lines, the pose at each frame's end on the sensor's clock.
-    changes.json: of each change its id, kind, polarity, the first pass that shows it, the object's id, the change it
-    is part of (the place that an opened door left) or null, its centroid, how many returns the sensor got from it in
-    the last pass with it before (disappeared) or the first after (appeared), these returns' points at 5 cm voxels,
-    and for each point whether the pass on the other side of the change looked through it (1) or not (0).
-    objects.json: the kind of each object id. labels.npz: for each frame (member "000000", ...) the object id (H, W) of
-    each return, staggered; 0 = no return.
+    changes.json: of each change its id, kind, polarity, the first pass that shows it, the object's id, the
+    change it is part of (the place that an opened door left) or null, its centroid, how many returns the
+    sensor got from it in the last pass before (disappeared) or the first after (appeared), these returns'
+    points at 5 cm voxels, and for each point whether the pass on the other side of the change looked through
+    it (1) or not (0).
+    objects.json: the kind of each object id.
+    labels.npz: for each frame (member "000000", ...) the object id (H, W) of each return, staggered; 0 = no
+    return.
     """
 
     def __init__(self, folder: Path, world: World):
@@ -60,13 +62,23 @@ class Truth:
         returns = _gathered(self._seen, change.object_id, seen_in)
         surface = thin(returns, VOXEL_M)
         looks = thin(_gathered(self._looks, change.object_id, absent_in), VOXEL_M)
-        confirmable = cKDTree(looks).query(surface)[0] < CONFIRM_M if len(looks) and len(surface) else np.zeros(len(surface), bool)
+        confirmable = (
+            cKDTree(looks).query(surface)[0] < CONFIRM_M
+            if len(looks) and len(surface)
+            else np.zeros(len(surface), bool)
+        )
         middle = surface.mean(0) if len(surface) else self._world.items[change.object_id - 1].mesh.vertices.mean(0)
         centroid, surface = (points @ T_map_world[:3, :3].T + T_map_world[:3, 3] for points in (middle, surface))
         return {
-            "id": index, "kind": change.kind, "polarity": change.polarity, "pass": change.pass_index,
-            "object": change.object_id, "part_of": change.part_of, "centroid": centroid.round(3).tolist(),
-            "n_visible_returns": len(returns), "points": surface.round(3).tolist(),
+            "id": index,
+            "kind": change.kind,
+            "polarity": change.polarity,
+            "pass": change.pass_index,
+            "object": change.object_id,
+            "part_of": change.part_of,
+            "centroid": centroid.round(3).tolist(),
+            "n_visible_returns": len(returns),
+            "points": surface.round(3).tolist(),
             "confirmable": confirmable.astype(int).tolist(),
         }
 

@@ -1,9 +1,10 @@
-"""What a pass says of the changing things: returns from those that are there, looks through those that are not."""
+"""What a pass says of the changing things: returns from those there, looks through those that are not."""
 
 import numpy as np
 
 from ..frame import Sensor
-from .raycast import Hits, Solid, rays
+from .embree import Solid
+from .raycast import Hits, rays
 from .worlds import World
 
 WITHIN_M = 30.0  # a return or a look from farther away does not count
@@ -18,7 +19,8 @@ class Witness:
         self._there = np.array([k for k in watched if world.items[k - 1].is_there(pass_index)], np.uint16)
         self._absent = [
             (k, world.items[k - 1].mesh.vertices.mean(0), Solid(world.items[k - 1].mesh))
-            for k in watched if not world.items[k - 1].is_there(pass_index)
+            for k in watched
+            if not world.items[k - 1].is_there(pass_index)
         ]
 
     def surface(self, sensor: Sensor, pose: np.ndarray, hits: Hits, labels: np.ndarray) -> np.ndarray:
@@ -28,12 +30,14 @@ class Witness:
         """
         seen = np.isin(labels, self._there) & (labels == hits.object_id) & (hits.range_m < WITHIN_M)
         row, column = np.nonzero(seen)
-        local = sensor.direction[row, column].astype(float) * hits.range_m[row, column, None] + sensor.offset[row, column]
+        local = (
+            sensor.direction[row, column].astype(float) * hits.range_m[row, column, None] + sensor.offset[row, column]
+        )
         point = np.einsum("kij,kj->ki", pose[column, :3, :3], local) + pose[column, :3, 3]
         return np.concatenate([labels[row, column, None], point], 1)
 
     def looks(self, sensor: Sensor, pose: np.ndarray, range_mm: np.ndarray) -> np.ndarray:
-        """Where beams went through the place of an absent thing -> (K, 4) float64: object id and point, world frame.
+        """Where beams went through absent things -> (K, 4) float64: object id and point, world frame.
 
         range_mm: (H, W) as measured; a beam without a return has seen nothing.
         """

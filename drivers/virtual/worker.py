@@ -1,4 +1,4 @@
-"""One process of a simulation: casts a run of frames, writes their packets to a part of the pcap, reports each."""
+"""One process of a simulation: casts a run of frames, writes their packets to a file, reports each."""
 
 import pickle
 import sys
@@ -44,7 +44,7 @@ class Shot:
 
 
 def run(job: Job, world: World) -> Iterator[Shot]:
-    """Writes the part, yielding a Shot after each frame. The same frames give the same bytes in whatever job."""
+    """Writes the part, yielding a Shot after each frame. Equal frames give equal bytes in whatever job."""
     records = None
     with open(job.part, "wb") as out:
         for shot, packets in frames(job, world):
@@ -70,7 +70,10 @@ def frames(job: Job, world: World) -> Iterator[tuple[Shot, list]]:
         fields = receive(hits, sensor.pixel_shift, np.random.default_rng([job.seed, index]))
         packets = encoder.packets(encoder.frame(index, fields))
         labels = fields["object"]
-        surface, looks = witness.surface(sensor, pose, hits, labels), witness.looks(sensor, pose, fields["RANGE"])
+        surface, looks = (
+            witness.surface(sensor, pose, hits, labels),
+            witness.looks(sensor, pose, fields["RANGE"]),
+        )
         yield Shot(index, int(stamp[-1]), pose[-1], pass_index, labels, surface, looks), packets
 
 

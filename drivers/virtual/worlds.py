@@ -55,7 +55,12 @@ class World:
     @property
     def kinds(self) -> list[str]:
         """Kind of each object id; id 0 is no return, the last one the robot itself."""
-        return ["nothing", *(item.kind for item in self.items), *(mover.kind for mover in self.movers), "vehicle"]
+        return [
+            "nothing",
+            *(item.kind for item in self.items),
+            *(mover.kind for mover in self.movers),
+            "vehicle",
+        ]
 
 
 def build_world(scenario: Scenario, seed: int) -> World:
@@ -79,7 +84,16 @@ def build_world(scenario: Scenario, seed: int) -> World:
         changes += _changes(one, len(items), len(changes), scenario.passes)
         items += [Item(*state) for state in one.states]
     lay.rng = streams[4]
-    return World(seed, scenario, route, terrain, patrol, tuple(items), tuple(movers(lay, scenario, patrol)), tuple(changes))
+    return World(
+        seed,
+        scenario,
+        route,
+        terrain,
+        patrol,
+        tuple(items),
+        tuple(movers(lay, scenario, patrol)),
+        tuple(changes),
+    )
 
 
 def random_world(seed: int, scenario: str = "short", length_m: float | None = None) -> World:
@@ -93,7 +107,11 @@ def _passes(scenario: Scenario, terrain: Terrain, rng) -> list[Pass]:
     spread = np.array([0.1, -0.85, -0.45, -1.2]) if terrain.road_half_m > 3.0 else np.array([0.0, 0.55, -0.5, 0.3])
     offsets = rng.permutation(spread)
     return [
-        Pass(float(offsets[k % 4] + rng.normal(0, 0.08)), float(rng.uniform(*scenario.speed_m_s)), scenario.reversed_pass == k)
+        Pass(
+            float(offsets[k % 4] + rng.normal(0, 0.08)),
+            float(rng.uniform(*scenario.speed_m_s)),
+            scenario.reversed_pass == k,
+        )
         for k in range(scenario.passes)
     ]
 
