@@ -11,6 +11,7 @@ from .hull import convex_hull, distance_m, grown_area_m2
 
 RETURN_REACH_M = 2.0  # a robot this near to where it was in the same visit ...
 RETURN_PATH_M = 10.0  # ... so much of its path ago has come back: that is another visit
+TURN_REACH_M = 1.5  # a robot stands and turns there: what changes meanwhile belongs to the new visit
 
 
 @dataclass(eq=False)
@@ -60,14 +61,15 @@ class Visit:
         return rest
 
     def _turning_point(self, xy: np.ndarray) -> int | None:
-        """Index of the scan farthest from xy since the robot was there before."""
+        """Index of the first scan of the turn: near the place farthest from xy since the robot was there before."""
         path = np.array([*self.path, xy])
         travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
         away = np.linalg.norm(path - xy, axis=1)
         before = np.flatnonzero((travelled < travelled[-1] - RETURN_PATH_M) & (away < RETURN_REACH_M))
         if len(before) == 0:
             return None
-        return int(before[-1] + np.argmax(away[before[-1] :]))
+        since = away[before[-1] :]
+        return int(before[-1] + np.argmax(since > since.max() - TURN_REACH_M))
 
 
 @dataclass(frozen=True, eq=False)
