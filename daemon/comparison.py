@@ -33,7 +33,6 @@ class Selection:
 class Job:
     """What to compare."""
 
-    data: Path
     cumulative: Selection
     recent: Selection
     erasures: list[Erasure]  # removed objects, known before the visit

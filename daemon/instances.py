@@ -87,7 +87,6 @@ class ChangeDetection:
         positions = cumulative.T_map_sensor[:, :3, 3]
         box = positions.min(axis=0) - range_m, positions.max(axis=0) + range_m
         return Job(
-            self._store.dir.path,
             Selection(cumulative.session, cumulative.scan_id, cumulative.visit_number),
             Selection(recent.session, recent.scan_id, recent.visit_number),
             self._manager.erasures(instance.map_id, box, (instance.session_id, instance.t_in_ns)),
