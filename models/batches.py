@@ -1,36 +1,34 @@
-"""Training batches: which scans stand side by side, and how their inputs are spoilt."""
+"""Training batches: how inputs are spoilt, and which scans stand side by side."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from .network import Statistics
 from .preprocess import LOG_RANGE_GAIN, N_COLUMNS, N_ROWS
+from .scan_sets import CachedWorld
 
-WORLDS_PER_BATCH = 2
+WORLDS_PER_BATCH = 3
 # Overlaps of the companions drawn for each anchor scan: pairs from all over the range stand in every batch.
 COMPANION_OVERLAPS = ((0.7, 1.0), (0.45, 0.7), (0.2, 0.45))
-MAX_LOG_SCALE = 0.3
-NOISE = 0.004  # of the input's logarithmic range: 2 % of the range
+NOISE = 0.02 * LOG_RANGE_GAIN  # 2 % of the range
+SCANS_AT_ONCE = 8
 
 
 @dataclass(frozen=True, eq=False)
-class CachedWorld:
-    """One world of the scan set, ready for training.
+class StatisticsOfWorld:
+    """One world, ready for training: (V, N, S) float16, N scans in V variants; (N, N) float32 overlaps."""
 
-    inputs: (V, N, 3, 32, 256) float16, each scan through V sensors; overlap: (N, N); position_m: (N, 3);
-    season: (N,).
-    """
-
-    inputs: np.ndarray
+    statistics: torch.Tensor
     overlap: np.ndarray
-    position_m: np.ndarray
-    season: np.ndarray
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """(n,) indices: anchors, each followed by one companion per range of COMPANION_OVERLAPS."""
-        drawn = []
+        drawn: list[int] = []
         while len(drawn) < n:
             anchor = rng.integers(len(self.overlap))
             drawn.append(anchor)
@@ -40,27 +38,36 @@ class CachedWorld:
         return np.array(drawn[:n])
 
 
-def draw_batch(worlds: list[CachedWorld], rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs (n, 3, 32, 256) float32, spoilt, and the overlaps (n, n) float32 of all their pairs."""
+@torch.no_grad()
+def statistics_of_worlds(worlds: Iterable[CachedWorld], spoilt: bool) -> list[StatisticsOfWorld]:
+    """The statistics of every scan through every sensor and, if asked, of spoilt copies as well."""
+    statistics = Statistics().eval()
+    done = []
+    for world in worlds:
+        rng = np.random.default_rng((world.seed, 10))
+        inputs = [sensor.astype(np.float32) for sensor in world.inputs]
+        if spoilt:
+            inputs += [spoil(sensor.copy(), rng) for sensor in inputs]
+        variants = []
+        for scans in inputs:
+            parts = torch.from_numpy(scans).split(SCANS_AT_ONCE)
+            variants.append(torch.cat([statistics(part) for part in parts]).half())
+        done.append(StatisticsOfWorld(torch.stack(variants), world.overlap))
+    return done
+
+
+def draw_batch(worlds: list[StatisticsOfWorld], rng: np.random.Generator, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Statistics (n, S) float32 of scans of a few worlds, and the overlaps (n, n) float32 of all their pairs."""
     part = n // WORLDS_PER_BATCH
     overlap = np.zeros((n, n), np.float32)  # between worlds nothing is shared
-    inputs = []
+    drawn = []
     for block, world_index in enumerate(rng.choice(len(worlds), WORLDS_PER_BATCH, replace=False)):
         world = worlds[world_index]
         index = world.draw(rng, part)
-        sensor = rng.integers(len(world.inputs), size=part)
-        inputs.append(_reshape_world(world.inputs[sensor, index].astype(np.float32), rng))
+        drawn.append(world.statistics[rng.integers(len(world.statistics), size=part), index])
         rows = slice(block * part, (block + 1) * part)
         overlap[rows, rows] = world.overlap[np.ix_(index, index)]
-    return spoil(np.concatenate(inputs), rng), overlap
-
-
-def _reshape_world(inputs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same scans in a world of another size, in half the cases mirrored: overlaps stay as they were."""
-    inputs[:, 0] += (inputs[:, 1] > 0) * np.float32(
-        rng.uniform(-MAX_LOG_SCALE, MAX_LOG_SCALE) * LOG_RANGE_GAIN
-    )
-    return np.flip(inputs, axis=3) if rng.random() < 0.5 else inputs
+    return torch.cat(drawn).float(), torch.from_numpy(overlap)
 
 
 def spoil(inputs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -74,7 +81,7 @@ def spoil(inputs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     # Captures re-encoded from other sensors often have nothing above the horizon.
     empty[rng.random(n) < 0.1, : rng.integers(8, 15)] = True
     inputs[:, :2] *= ~empty[:, None]
-    for scan in np.flatnonzero(rng.random(n) < 0.4):
+    for scan in np.flatnonzero(rng.random(n) < 0.6):
         inputs[scan][:, :, _lost_columns(rng)] = 0
     return inputs
 

@@ -84,8 +84,7 @@ def _check_card(path: Path, card: dict, digest: str) -> None:
         raise ModelError(f"model card {path.with_suffix('.json')} lacks sha256 or calibration")
     if card["sha256"] != digest:
         raise ModelError(
-            f"model {path} has sha256 {digest[:12]}..., its card is of {str(card['sha256'])[:12]}...: "
-            "restore the pair"
+            f"model {path} has sha256 {digest[:12]}..., its card is of {str(card['sha256'])[:12]}...: restore the pair"
         )
     _check_curve(path.with_suffix(".json"), card["calibration"])
 

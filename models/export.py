@@ -93,7 +93,5 @@ def _export(network: DescriptorNetwork, path: Path) -> float:
     found = np.concatenate([session.run(None, {"scan": scan[None].numpy()})[0] for scan in scans])
     difference = float(np.abs(found - wanted).max())
     if difference > EXPORT_TOLERANCE:
-        raise RuntimeError(
-            f"{path} differs from the network by {difference:.2g}, allowed {EXPORT_TOLERANCE:.0e}"
-        )
+        raise RuntimeError(f"{path} differs from the network by {difference:.2g}, allowed {EXPORT_TOLERANCE:.0e}")
     return difference

@@ -6,6 +6,7 @@ Seeds of worlds keep the three sets apart: no world of validation or test is eve
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from ..drivers.virtual.mesh import rotation
 from ..drivers.virtual.raycast import Caster
 from ..drivers.virtual.sensor import receive, virtual_metadata
 from ..drivers.virtual.worlds import World, random_world
-from .batches import CachedWorld
 from .overlap import RangeView, overlap_matrix, view_of_scan
 from .preprocess import Resampler
 
@@ -65,9 +65,7 @@ class WorldScans:
         rows = slice(0, None, beams // REFERENCE_BEAMS)
         step = columns // REFERENCE_COLUMNS
         shift, altitude = self.pixel_shift[rows] // step, self.altitude_rad[rows]
-        return [
-            view_of_scan(image[rows, ::step], shift, altitude, self.azimuth_0_rad) for image in self.range_mm
-        ]
+        return [view_of_scan(image[rows, ::step], shift, altitude, self.azimuth_0_rad) for image in self.range_mm]
 
     def overlaps(self) -> np.ndarray:
         """(N, N) float32 true overlap of every pair."""
@@ -94,31 +92,52 @@ class WorldScans:
         return np.stack([resample(image) for image in self.range_mm])
 
 
-def places(world: World, rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 4, 4) T_world_sensor, any yaw: anchors on the route and anywhere, and neighbours at 0.2 to 20 m."""
+@dataclass(frozen=True, eq=False)
+class CachedWorld:
+    """The scans of the world of a seed as the network's inputs: (V, N, 3, 32, 256) float16, each through V
+    sensors; and their true overlaps, (N, N) float32.
+    """
+
+    seed: int
+    inputs: np.ndarray
+    overlap: np.ndarray
+
+
+def anywhere(world: World, rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 2) metres: anchors on the route and elsewhere, each with neighbours at 0.2 to 20 m."""
     terrain, route = world.terrain, world.route
     inner = terrain.bounds + np.array([[EDGE_M], [-EDGE_M]])
     n_anchors = -(-n // (1 + NEIGHBOURS))
     on_route = route.beside(rng.uniform(0, route.length_m, n_anchors), rng.normal(0, 1.5, n_anchors))
-    anywhere = rng.uniform(inner[0], inner[1], (n_anchors, 2))
-    anchors = np.where(rng.random((n_anchors, 1)) < ON_ROUTE, on_route, anywhere)
+    off_route = rng.uniform(inner[0], inner[1], (n_anchors, 2))
+    anchors = np.where(rng.random((n_anchors, 1)) < ON_ROUTE, on_route, off_route)
     reach = np.exp(rng.uniform(np.log(0.2), np.log(20.0), (NEIGHBOURS, n_anchors, 1)))
     bearing = rng.uniform(0, 2 * np.pi, (NEIGHBOURS, n_anchors))
     around = anchors + reach * np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
-    xy = np.clip(np.concatenate((anchors[None], around)).reshape(-1, 2)[:n], inner[0], inner[1])
+    return np.clip(np.concatenate((anchors[None], around)).reshape(-1, 2)[:n], inner[0], inner[1])
+
+
+def along_route(world: World, rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 2) metres: where a patrol would pass."""
+    return world.route.beside(rng.uniform(0, world.route.length_m, n), rng.normal(0, 0.8, n))
+
+
+def _poses(world: World, rng: np.random.Generator, xy: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) T_world_sensor at (n, 2) metres, any yaw, one mounting height for all."""
+    n = len(xy)
     pose = np.tile(np.eye(4), (n, 1, 1))
     pose[:, :3, :3] = rotation(rng.uniform(-np.pi, np.pi, n), *rng.normal(0, np.deg2rad(TILT_DEG), (2, n)))
     pose[:, :2, 3] = xy
-    pose[:, 2, 3] = terrain.slope_height(xy) + rng.uniform(*HEIGHT_M) + rng.normal(0, 0.05, n)
+    pose[:, 2, 3] = world.terrain.slope_height(xy) + rng.uniform(*HEIGHT_M) + rng.normal(0, 0.05, n)
     return pose
 
 
-def scan_world(seed: int, n: int, beams: int, columns: int) -> WorldScans:
-    """About n scans of the world of a seed: poses that stand inside something are left out."""
+def scan_world(seed: int, n: int, beams: int, columns: int, places: Callable[..., np.ndarray] = anywhere) -> WorldScans:
+    """About n scans of the world of a seed, at `places`; those that stand inside something are left out."""
     rng = np.random.default_rng((seed, 7))
     world = random_world(seed, str(rng.choice(SCENARIOS)), float(rng.uniform(*ROUTE_M)))
     sensor = sensor_from_metadata(virtual_metadata(beams, columns, serial=122_300_000_000 + seed))
-    poses = places(world, rng, n)
+    poses = _poses(world, rng, places(world, rng, n))
     seasons = rng.integers(world.scenario.passes, size=n)
     images = np.empty((n, *sensor.shape), np.uint32)
     for season in np.unique(seasons):
@@ -139,20 +158,18 @@ def scan_world(seed: int, n: int, beams: int, columns: int) -> WorldScans:
     )
 
 
-def cached_worlds(folder: Path, role: str, count: int) -> list[CachedWorld]:
+def cached_worlds(folder: Path, role: str, count: int) -> Iterator[CachedWorld]:
     """The first `count` worlds of a role; scans come from the folder's cache or are newly made into it."""
     folder.mkdir(parents=True, exist_ok=True)
-    worlds = []
     for seed in range(FIRST_SEED[role], FIRST_SEED[role] + count):
         path = folder / f"{seed}.npz"
         if not path.exists():
             _make(seed, path)
-            log.info("scanned %s world %d of %d", role, len(worlds) + 1, count)
+            log.info("scanned %s world %d of %d", role, seed - FIRST_SEED[role] + 1, count)
         with np.load(path) as stored:
             fields = {name: stored[name] for name in stored.files}
         overlap = fields.pop("overlap")
-        worlds.append(_through_sensors(WorldScans(**fields), overlap, seed))
-    return worlds
+        yield _through_sensors(WorldScans(**fields), overlap, seed)
 
 
 def _make(seed: int, path: Path) -> None:
@@ -175,7 +192,7 @@ def _through_sensors(scans: WorldScans, overlap: np.ndarray, seed: int) -> Cache
         scans.seen_by(narrow_step, 1, np.deg2rad(FIRST_OS1_FOV_DEG)),
     )
     inputs = np.stack([sensor.inputs() for sensor in sensors]).astype(np.float16)
-    return CachedWorld(inputs, overlap, scans.T_world_sensor[:, :3, 3], scans.season)
+    return CachedWorld(seed, inputs, overlap)
 
 
 def _poses_of_columns(T_world_sensor: np.ndarray, rng: np.random.Generator, columns: int) -> np.ndarray:
@@ -185,9 +202,7 @@ def _poses_of_columns(T_world_sensor: np.ndarray, rng: np.random.Generator, colu
     bearing, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0, SPEED_M_S)
     moved = np.tile(np.eye(4), (columns, 1, 1))
     moved[:, :3, :3] = turned
-    moved[:, 0, 3], moved[:, 1, 3] = (
-        before_end_s * speed * side for side in (np.cos(bearing), np.sin(bearing))
-    )
+    moved[:, 0, 3], moved[:, 1, 3] = (before_end_s * speed * side for side in (np.cos(bearing), np.sin(bearing)))
     return T_world_sensor @ moved
 
 

@@ -82,17 +82,13 @@ def test_predicted_overlap_falls_with_distance_from_one(model):
 
 def test_an_overlap_and_its_distance_belong_together(model):
     for overlap in (0.2, 0.4, 0.6):
-        assert model.overlap_from_distance(model.distance_from_overlap(overlap)) == pytest.approx(
-            overlap, abs=1e-6
-        )
+        assert model.overlap_from_distance(model.distance_from_overlap(overlap)) == pytest.approx(overlap, abs=1e-6)
 
 
 def test_a_model_of_another_shape_is_refused(copied):
     copied.write_bytes(OTHER_MODEL)
     change_card(copied, sha256=hashlib.sha256(OTHER_MODEL).hexdigest())
-    with pytest.raises(
-        ModelError, match=r"maps \[\[1, 1, 64, 900\]\].*want \[\[1, 3, 32, 256\]\] to \[\[1, 256\]\]"
-    ):
+    with pytest.raises(ModelError, match=r"maps \[\[1, 1, 64, 900\]\].*want \[\[1, 3, 32, 256\]\] to \[\[1, 256\]\]"):
         DescriptorModel.load(copied)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from revisitd.models.descriptor import DescriptorModel
 from revisitd.models.metrics import descriptor_distances, pairs, rank_agreement, recall
 from revisitd.models.preprocess import N_COLUMNS
-from revisitd.models.scan_sets import FIRST_SEED, SCANS_PER_WORLD, WorldScans, scan_world
+from revisitd.models.scan_sets import FIRST_SEED, SCANS_PER_WORLD, WorldScans, along_route, anywhere, scan_world
 
 NEAR_M = 25.0
 PLACE_M = 3.0
@@ -35,9 +35,7 @@ class Measured:
         self.descriptors = [describe(model, world) for world in worlds]
         self.distance = np.concatenate([pairs(descriptor_distances(some)) for some in self.descriptors])
         self.contexts = [scan_contexts(world) for world in worlds]
-        self.context_distance = np.concatenate(
-            [pairs(context_distances(some, some)) for some in self.contexts]
-        )
+        self.context_distance = np.concatenate([pairs(context_distances(some, some)) for some in self.contexts])
 
     def recalls(self, distances: np.ndarray, k: int) -> float:
         """Of the scans of later seasons, looked up among those of the first season of every world."""
@@ -58,9 +56,7 @@ class Measured:
 
 def describe(model: DescriptorModel, world: WorldScans) -> np.ndarray:
     """(N, 256) float32."""
-    return np.stack(
-        [model.describe(image, world.pixel_shift, world.altitude_rad) for image in world.range_mm]
-    )
+    return np.stack([model.describe(image, world.pixel_shift, world.altitude_rad) for image in world.range_mm])
 
 
 def with_lost_packets(world: WorldScans, rng: np.random.Generator) -> WorldScans:
@@ -87,8 +83,7 @@ def context_distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(N, M): one minus the mean cosine of the sectors at the best of all rotations."""
     a, b = np.fft.rfft(one, axis=2), np.fft.rfft(other, axis=2)
     distances = [
-        1.0 - np.fft.irfft((row.conj()[None] * b).sum(axis=1), SECTORS, axis=1).max(axis=1) / SECTORS
-        for row in a
+        1.0 - np.fft.irfft((row.conj()[None] * b).sum(axis=1), SECTORS, axis=1).max(axis=1) / SECTORS for row in a
     ]
     return np.stack(distances)
 
@@ -175,9 +170,7 @@ def plot(measured: Measured, path: Path) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(7, 5), layout="constrained")
-    cells = axes.hexbin(
-        measured.distance, measured.overlap, gridsize=60, bins="log", cmap="viridis", mincnt=1
-    )
+    cells = axes.hexbin(measured.distance, measured.overlap, gridsize=60, bins="log", cmap="viridis", mincnt=1)
     grid = np.linspace(0, measured.distance.max(), 200)
     axes.plot(
         grid,
@@ -185,34 +178,29 @@ def plot(measured: Measured, path: Path) -> None:
         color="tab:red",
         label="calibration curve of the card",
     )
-    axes.set(
-        xlabel="descriptor distance", ylabel="overlap", title="Held-out virtual worlds, all pairs of scans"
-    )
+    axes.set(xlabel="descriptor distance", ylabel="overlap", title="Held-out virtual worlds, all pairs of scans")
     axes.legend()
     figure.colorbar(cells, label="pairs")
     figure.savefig(path, dpi=130)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=6)
     parser.add_argument("--model", type=Path, help="another .onnx with its card beside it")
     parser.add_argument("--plot", type=Path, help="write distance against overlap to this PNG")
     arguments = parser.parse_args()
     model = DescriptorModel.load(arguments.model)
-    worlds = [
-        scan_world(FIRST_SEED["test"] + k, SCANS_PER_WORLD, beams=128, columns=1024)
-        for k in range(arguments.worlds)
-    ]
-    measured = Measured(worlds, model)
-    print(
-        f"model {model.model_id}: {len(worlds)} worlds, {sum(len(world.season) for world in worlds)} scans "
-        f"of OS1-128 1024x10, {len(measured.overlap)} pairs, {measured.n_queries()} queries"
-    )
-    print(table(measured))
-    print(robustness(measured))
+    for name, places in {"along the patrol's route": along_route, "anywhere in the world": anywhere}.items():
+        seeds = range(FIRST_SEED["test"], FIRST_SEED["test"] + arguments.worlds)
+        worlds = [scan_world(seed, SCANS_PER_WORLD, 128, 1024, places) for seed in seeds]
+        measured = Measured(worlds, model)
+        print(
+            f"model {model.model_id}, places {name}: {len(worlds)} worlds, {len(measured.overlap)} pairs of "
+            f"{sum(len(world.season) for world in worlds)} OS1-128 scans, {measured.n_queries()} queries"
+        )
+        print(table(measured))
+        print(robustness(measured), end="\n\n")
     if arguments.plot:
         plot(measured, arguments.plot)
 
