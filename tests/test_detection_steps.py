@@ -1,5 +1,7 @@
 """Each step of the detector against brute force or a world known by construction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
@@ -100,7 +102,11 @@ def test_a_patch_of_ground_is_ground_like_and_a_bag_is_not():
     _, ground = segment_ground(points, np.zeros(2), 3.0, 0.035)
     patch = points[(kind == 0) & (np.abs(points[:, 0] - 10) < 1) & (np.abs(points[:, 1]) < 1)]
     assert is_ground_like(patch + np.float32([0, 0, 0.08]), ground, 0.15, 0.9)
+    bump = patch[np.linalg.norm(patch[:, :2] - [10, 0], axis=1) < 0.6] + np.float32([0, 0, 0.2])
+    assert is_ground_like(bump, ground, 0.15, 0.9)
     assert not is_ground_like(points[kind == 2], ground, 0.15, 0.9)
+    low = points[kind == 2]
+    assert not is_ground_like(low[low[:, 2] < np.quantile(low[:, 2], 0.6)], ground, 0.15, 0.9)
     assert not is_ground_like(patch + np.float32([0, 0, 0.5]), ground, 0.15, 0.9)
 
 
@@ -155,7 +161,7 @@ def test_what_the_own_visit_looks_through_has_not_stayed():
     standing = image(wall_at(5.0, half_width=0.3))
     person = np.array([[5, 0, 0]], np.float32)
     scan = np.zeros(1, np.int16)
-    stamps = np.arange(5)
+    stamps = np.arange(5) * 1_000_000_000
 
     def submap(images, visit):
         return Submap(with_person, np.zeros(len(with_person), np.int16), images, np.array(visit), stamps)
@@ -163,6 +169,7 @@ def test_what_the_own_visit_looks_through_has_not_stayed():
     walked_on = submap([standing, empty, empty, empty], [1, 1, 1, 1])
     stayed = submap([standing] * 4, [1, 1, 1, 1])
     appeared_later = submap([standing] * 3 + [empty, empty], [2, 2, 2, 1, 1])
-    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3)[0]
-    assert persistent(person, scan, stayed, 0.3, 18.0, 3)[0]
-    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3)[0]
+    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3, 2.0)[0]
+    assert persistent(person, scan, stayed, 0.3, 18.0, 3, 2.0)[0]
+    assert not persistent(person, scan, replace(stayed, stamp_ns=stamps // 10), 0.3, 18.0, 3, 2.0)[0]  # only a moment
+    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3, 2.0)[0]

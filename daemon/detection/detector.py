@@ -31,6 +31,7 @@ class Thresholds:
     occlusion_margin_m: float
     min_confirming_scans: int
     min_showing_scans: int
+    min_showing_s: float
     cluster_distance_m: float
     min_points: int
     ground_filter_c1_m: float
@@ -105,11 +106,12 @@ def _one_way(
     candidate = candidate[dense_enough(this.points[candidate], t.rho_m, t.n)]
     watch.lap("noise")
     points, scan = this.points[candidate], this.scan[candidate]
-    seen = latest_sight(points, other, t.occlusion_margin_m, t.occlusion_range_m, t.min_confirming_scans)
+    sight_limits = (t.occlusion_margin_m, t.occlusion_range_m)
+    seen = latest_sight(points, other, *sight_limits, t.min_confirming_scans)
     confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
     possible = confirmed | (seen.at <= seen.through)
     possible[possible] = persistent(
-        points[possible], scan[possible], this, t.occlusion_margin_m, t.occlusion_range_m, t.min_showing_scans
+        points[possible], scan[possible], this, *sight_limits, t.min_showing_scans, t.min_showing_s
     )
     confirmed &= possible
     watch.lap("occlusion")
@@ -122,7 +124,7 @@ def _one_way(
             continue
         if is_ground_like(points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
             continue
-        through = scans_looking_through(points[sure], other.images, t.occlusion_margin_m, t.occlusion_range_m)
+        through = scans_looking_through(points[sure], other.images, *sight_limits)
         if len(through) < t.min_confirming_scans:
             continue
         own_ns, other_ns = this.stamp_ns[own_scans], other.stamp_ns[through]

@@ -16,6 +16,9 @@ FIT_DISTANCE_M = 0.12
 MIN_BIN_CELLS = 10  # of the hundred in a bin
 MIN_UPRIGHT = 0.85  # cosine of 32 degrees
 MAX_STEP_M = 0.35  # a bin's plane so far above what its neighbours say is a roof or a hedge, not ground
+FLAT_HEIGHT_M = 0.3  # a level sheet this near to the ground is ground: a bump, a kerb, a puddle's rim
+FLAT_SIGMA_M = 0.04  # thickness of a sheet, one sigma
+FLAT_RATIO = 0.25  # ... and against its width
 MAX_BORROW_M = 6.0  # a bin without a plane of its own uses the nearest one within this
 
 
@@ -81,7 +84,14 @@ def is_ground_like(points: np.ndarray, ground: Ground, c1_m: float, c2: float) -
     b1 = abs((mean - ground.mean[index[0]]) @ ground.normal[index[0]])
     log_det = [np.linalg.slogdet(m)[1] for m in (0.5 * (sigma_g + sigma_o), sigma_g, sigma_o)]
     b2 = 0.5 * (log_det[0] - 0.5 * (log_det[1] + log_det[2]))
-    return bool(b1 < c1_m and b2 < c2)
+    return bool((b1 < c1_m and b2 < c2) or (b1 < FLAT_HEIGHT_M and _is_flat(sigma_o)))
+
+
+def _is_flat(covariance: np.ndarray) -> bool:
+    """Whether points lie as a level sheet: B2 compares sizes too, and a patch of ground is smaller than its bin."""
+    variance, axes = np.linalg.eigh(covariance)
+    thickness, width = np.sqrt(variance[0]), np.sqrt(variance[1])
+    return bool(thickness < FLAT_SIGMA_M and thickness < FLAT_RATIO * width and abs(axes[2, 0]) > MIN_UPRIGHT)
 
 
 def _polar_bins(points: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, int]:

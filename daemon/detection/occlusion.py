@@ -50,22 +50,29 @@ def latest_sight(points: np.ndarray, other: Submap, margin_m: float, range_m: fl
 
 
 def persistent(
-    points: np.ndarray, scan: np.ndarray, own: Submap, margin_m: float, range_m: float, min_scans: int
+    points: np.ndarray, scan: np.ndarray, own: Submap, margin_m: float, range_m: float, min_scans: int, min_s: float
 ) -> np.ndarray:
     """Which points (N, 3), each of scan (N,) of its own submap, stayed where they were through their own visit.
 
-    A thing that is there to stay is met by several scans of the visit that saw it, and hardly ever looked
-    through by them; a walking person is gone in the next scan, and leaves in the wind let beams through. That
-    nothing looks through is not enough: before the sky there is no return behind a walker's head. Scans of other
-    visits must not be asked: they did look through what appeared later.
+    A thing that is there to stay is met by several scans of the visit that saw it, over some seconds, and hardly
+    ever looked through by them; a walking person is gone in the next scan, a slow car a second later, and leaves in
+    the wind let beams through. That nothing looks through is not enough: before the sky there is no return behind a
+    walker's head. Scans of other visits must not be asked: they did look through what appeared later.
     """
     out = np.zeros(len(points), dtype=bool)
     visit = own.visit[scan]
     for v in np.unique(visit):
         of_visit = np.flatnonzero(visit == v)
-        images = [image for image, u in zip(own.images, own.visit, strict=True) if u == v]
-        seen = sight(points[of_visit], images, margin_m, range_m)
-        out[of_visit] = (seen.at >= min_scans) & (seen.through * 2 < seen.at)
+        through, at = np.zeros((2, len(of_visit)), dtype=np.int16)
+        first, last = np.full(len(of_visit), np.iinfo(np.int64).max), np.zeros(len(of_visit), dtype=np.int64)
+        for i in np.flatnonzero(own.visit == v):
+            seen = sight(points[of_visit], [own.images[i]], margin_m, range_m)
+            through += seen.through
+            at += seen.at
+            met = seen.at > 0
+            first[met] = np.minimum(first[met], own.stamp_ns[i])
+            last[met] = np.maximum(last[met], own.stamp_ns[i])
+        out[of_visit] = (at >= min_scans) & (through * 2 < at) & (last - first >= min_s * 1e9)
     return out
 
 
