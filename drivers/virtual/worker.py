@@ -91,5 +91,7 @@ def main() -> None:
         for shot in run(job, build_world(job.scenario, job.seed)):
             send(shot)
         send(None)
+    except BrokenPipeError:
+        sys.exit(1)  # nobody waits for the answer any more
     except Exception as error:
         send(error)

@@ -65,6 +65,7 @@ class World:
 
 def build_world(scenario: Scenario, seed: int) -> World:
     """The world of a scenario and a seed; the same arguments give the same world."""
+    # Streams of their own for route, ground and so on: a change to one leaves the others as they were.
     streams = [np.random.default_rng([seed, len(scenario.name), ord(scenario.name[0]), k]) for k in range(6)]
     length = streams[0].uniform(*scenario.length_m)
     route = (loop if scenario.closed else line)(streams[0], length)
