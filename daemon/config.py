@@ -62,7 +62,10 @@ class SceneConfig(_Section):
 
     alpha_m2: float = Field(120.0, gt=0, description="largest area of a scene (CDSD Table III)")
     beta: float = Field(
-        1.4, gt=0, le=2, description="largest descriptor distance between two scans of a scene (unit vectors: 0..2)"
+        1.2,
+        gt=0,
+        le=2,
+        description="largest descriptor distance between two scans of a scene; the model's card: an overlap of 23 %",
     )
     margin_m: float = Field(
         2.5, gt=0, description="a scene is its hull grown by this: a straight path has an area, a second lane is inside"
