@@ -10,6 +10,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from .comparison import Comparer, Comparison, Job
+from .memory import return_freed
 
 logger = logging.getLogger(__name__)
 
@@ -74,3 +75,5 @@ def _serve(connection: Connection, data: Path) -> None:
         except Exception as error:  # whatever went wrong is the parent's to judge
             answer = error
         connection.send(answer)
+        del job, answer
+        return_freed()

@@ -18,6 +18,7 @@ from ..storage.store import Store
 from .config import Config
 from .geometry import column_phase, deskew
 from .localization import Fix
+from .memory import return_freed
 from .odometry import Motion
 from .scenes import SceneUpdate
 from .sensors import Sensors
@@ -137,6 +138,8 @@ class Pipeline:
         for instance in session.record(update):
             self.counts.instances += 1
             self._worker.submit(instance, self._wait)
+        if update.ended_visits:
+            return_freed()
 
     def _start_session(self, frame: Frame) -> Session:
         self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source)
