@@ -121,11 +121,16 @@ def _floor_plan(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.
 
 
 def _ground_height(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Height of the ground under each point (N,): the lowest return in 2 m, its neighbours' median against outliers."""
+    """Height of the ground under each point (N,): a low return in 2 m, its neighbours' median against outliers."""
     shape = np.ceil((upper - lower) / 2.0).astype(int)
     x, y = np.minimum(((points[:, :2] - lower) / 2.0).astype(int), shape - 1).T
+    tile = x * shape[1] + y
+    order = np.lexsort((points[:, 2], tile))
+    count = np.bincount(tile, minlength=shape[0] * shape[1])
+    filled = np.flatnonzero(count)
+    low = (np.cumsum(count) - count + count // 20)[filled]  # what panes and puddles mirror lies below the ground
     ground = np.full(shape, np.inf, np.float32)
-    np.minimum.at(ground, (x, y), points[:, 2])
+    ground.flat[filled] = points[order[low], 2]
     nearest_seen = distance_transform_edt(np.isinf(ground), return_distances=False, return_indices=True)
     return median_filter(ground[tuple(nearest_seen)], size=3, mode="nearest")[x, y]
 
