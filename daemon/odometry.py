@@ -21,8 +21,8 @@ from kiss_icp.config import KISSConfig  # noqa: E402
 from kiss_icp.kiss_icp import KissICP  # noqa: E402
 
 MIN_POINTS = 1000  # fewer registrable returns than this say nothing about a pose
-CHECK_EVERY = 5  # frames between two looks at the overlap (15 ms each)
-OVERLAP_SAMPLE = 2000
+CHECK_EVERY = 5  # frames between two looks at the overlap (30 ms each)
+OVERLAP_SAMPLE = 1000
 MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth
 GAP_FRAMES = 1.5  # more than a jittering period: frames are missing
 
