@@ -48,7 +48,7 @@ class ReplayProgress:
 
 
 def summary_text(summary: Summary) -> str:
-    """Two lines of what a run did, and one of what was lost if something was."""
+    """Two lines of what a run did, and one for each thing that went wrong, if it did."""
     c = summary.counts
     lines = [
         f"{c.frames} frames in {summary.seconds:.1f} s ({c.frames / summary.seconds:.1f} frames/s), "
@@ -56,6 +56,8 @@ def summary_text(summary: Summary) -> str:
         f"{summary.instances_done} instances of change detection, {summary.instances_dropped} dropped, "
         f"{summary.instances_failed} failed; {summary.changes} changes",
     ]
+    if c.odometry_lost:
+        lines.append(f"odometry lost {c.odometry_lost} times: each began a session and a map of its own")
     if summary.losses:
         lines.append("lost: " + ", ".join(f"{count} x {cause}" for cause, count in summary.losses.items()))
     return "\n".join(lines)

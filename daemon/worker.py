@@ -40,11 +40,6 @@ class DetectionWorker:
         self.dropped = 0
         self._thread.start()
 
-    @property
-    def waiting(self) -> int:
-        """Instances in the queue."""
-        return self._queue.qsize()
-
     def submit(self, instance: Instance, wait: bool) -> bool:
         """Queue an instance; False when it was dropped."""
         try:
