@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..storage.changes import Change, ChangeObject, ChangeStore
-from .detection.detector import DetectedObject
+from .detection.results import ERASE_M, DetectedObject, Erasure
 
-ERASE_M = 0.3  # a removed object's points are erased from older scans within tau of what was seen of it
 TOUCH_M = 0.4  # objects nearer than the cluster distance are one
 MIN_TOUCH_SHARE = 0.15  # ... if so much of the smaller one touches: neighbours that graze each other stay two
 
@@ -28,30 +27,6 @@ class Finding:
     alignment_residual_m: float
     model_id: str
     config_digest: str
-
-
-@dataclass(frozen=True, eq=False)
-class Erasure:
-    """A removed object: points (N, 3) that older scans still show, and since when it is gone."""
-
-    points: np.ndarray
-    session: int
-    gone_ns: int
-
-
-def standing(points: np.ndarray, taken: np.ndarray, erasures: list[Erasure]) -> np.ndarray:
-    """Which points (N, 3) of scans taken (N, 2: session, sensor time) are not of a removed object.
-
-    What an object left in scans taken before it was gone is erased; scans taken after it came back stay.
-    """
-    stands = np.ones(len(points), dtype=bool)
-    for gone in erasures:
-        lower, upper = gone.points.min(axis=0) - ERASE_M, gone.points.max(axis=0) + ERASE_M
-        inside = ((points > lower) & (points < upper)).all(axis=1)
-        near = np.flatnonzero(inside & _before(taken, (gone.session, gone.gone_ns)))
-        distance, _ = cKDTree(gone.points).query(points[near], distance_upper_bound=ERASE_M)
-        stands[near[np.isfinite(distance)]] = False
-    return stands
 
 
 class ChangeManager:
@@ -87,21 +62,13 @@ class ChangeManager:
         """Metadata of all changes of at least n points."""
         return self._store.publish_change_list(n)
 
-    def update_map(
-        self, points: np.ndarray, taken: np.ndarray, map_id: int, until: tuple[int, int]
-    ) -> np.ndarray:
-        """Which points (N, 3) float32 of older scans still stand, by all that was known to be gone at a time.
-
-        taken (N, 2) int64: session and sensor time of each point's scan; until: session and sensor time. Only
-        what disappeared matters: what appeared is in the scans taken since.
-        """
-        box = points.min(axis=0), points.max(axis=0)
-        return standing(points, taken, self.erasures(map_id, box, until))
-
     def erasures(
         self, map_id: int, box: tuple[np.ndarray, np.ndarray], until: tuple[int, int]
     ) -> list[Erasure]:
-        """Removed objects in a box (lower and upper corner (3,), metres, map frame), first seen gone before a time."""
+        """Removed objects in a box (lower and upper corner (3,), metres, map frame), first seen gone before a time.
+
+        What update_map (detection/erasure.py) takes away. until: session and sensor time.
+        """
         lower, upper = box
         gone = self._store.changes(
             polarity="disappeared", map_id=map_id, box=(lower - ERASE_M, upper + ERASE_M), before=until
@@ -124,11 +91,6 @@ def _touch_share(a: np.ndarray, b: np.ndarray) -> float:
     small, large = (a, b) if len(a) <= len(b) else (b, a)
     distance, _ = cKDTree(large).query(small, distance_upper_bound=TOUCH_M)
     return float(np.isfinite(distance).mean())
-
-
-def _before(taken: np.ndarray, moment: tuple[int, int]) -> np.ndarray:
-    session, ns = moment
-    return (taken[:, 0] < session) | ((taken[:, 0] == session) & (taken[:, 1] < ns))
 
 
 def _confidence(found: DetectedObject) -> float:

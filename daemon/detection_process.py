@@ -9,7 +9,7 @@ import signal
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from .comparison import Comparer, Comparison, Job
+from .comparison import Comparison, Job
 from .memory import return_freed
 
 logger = logging.getLogger(__name__)
@@ -63,6 +63,11 @@ def _serve(connection: Connection, data: Path) -> None:
     """The child: answers jobs until the parent closes the pipe or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us in order
     os.nice(NICENESS)
+    if not os.access(Path(__file__).parent, os.W_OK):
+        # Beside an installed package that belongs to root, numba has nowhere to keep what it compiled.
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(data / "cache"))
+    from .comparer import Comparer
+
     comparer: Comparer | None = None
     while True:
         try:

@@ -10,7 +10,7 @@ from ..storage.store import Store
 from .changes import ChangeManager, Finding
 from .comparison import Comparison, Job, Selection
 from .config import Config
-from .detection.detector import DetectedObject, Thresholds
+from .detection.results import DetectedObject, Thresholds
 from .detection_process import ComparisonFailed, DetectionProcess
 from .submaps import select
 from .worker import Instance
@@ -42,9 +42,8 @@ class ChangeDetection:
         start = time.perf_counter()
         index, row = self._store.index, {"scene_id": instance.scene_id, "visit_id": instance.visit_id}
         try:
-            cumulative = self._choose(index.scans_of_scene(instance.scene_id, before_visit=instance.visit))
-            recent = self._choose(index.scans_of_scene(instance.scene_id, visit=instance.visit))
-            comparison = self._process.compare(self._job(cumulative, recent, instance))
+            job = self.job(instance)
+            comparison = self._process.compare(job)
         except (Rejected, ComparisonFailed) as why:
             status = "rejected" if isinstance(why, Rejected) else "failed"
             logger.info("instance %s scene=%d visit=%d: %s", status, instance.scene_id, instance.visit, why)
@@ -58,8 +57,8 @@ class ChangeDetection:
                 status="done",
                 seconds=time.perf_counter() - start,
                 stage_seconds=comparison.seconds,
-                n_cumulative_scans=len(cumulative.scan_id),
-                n_recent_scans=len(recent.scan_id),
+                n_cumulative_scans=len(job.cumulative.scan_id),
+                n_recent_scans=len(job.recent.scan_id),
                 n_candidates=comparison.detection.n_candidates,
                 n_confirmed=comparison.detection.n_confirmed,
                 n_changes=n_new,
@@ -82,8 +81,11 @@ class ChangeDetection:
         k = max(MIN_SCANS, round(self._config.submaps.k * self._config.scenes.alpha_m2 / REFERENCE_ALPHA_M2))
         return usable.only(select(usable.descriptors, usable.visit_number, k))
 
-    def _job(self, cumulative: SceneScans, recent: SceneScans, instance: Instance) -> Job:
-        range_m = self._config.submaps.range_m
+    def job(self, instance: Instance) -> Job:
+        """What is to be compared. Raises Rejected where a submap would say too little."""
+        index, range_m = self._store.index, self._config.submaps.range_m
+        cumulative = self._choose(index.scans_of_scene(instance.scene_id, before_visit=instance.visit))
+        recent = self._choose(index.scans_of_scene(instance.scene_id, visit=instance.visit))
         positions = cumulative.T_map_sensor[:, :3, 3]
         box = positions.min(axis=0) - range_m, positions.max(axis=0) + range_m
         return Job(

@@ -31,6 +31,11 @@ class Sensor:
         return self.direction.shape[:2]
 
     @cached_property
+    def lidar_origin(self) -> np.ndarray:
+        """(3,) float64 metres, sensor frame: the middle of the places that the beams leave from."""
+        return self.offset.reshape(-1, 3).mean(axis=0, dtype=np.float64)
+
+    @cached_property
     def in_window(self) -> np.ndarray:
         """(W,) bool: the columns that the sensor sends."""
         first, last = self.column_window

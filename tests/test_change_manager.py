@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from revisitd.daemon.changes import ChangeManager, Finding
-from revisitd.daemon.detection.detector import DetectedObject
+from revisitd.daemon.detection.erasure import update_map
+from revisitd.daemon.detection.results import DetectedObject
+from revisitd.daemon.detection.submap import Submap
 from revisitd.storage.store import Store
 
 S = 1_000_000_000
@@ -73,22 +75,31 @@ def test_neighbours_that_hardly_touch_stay_two(store):
     assert manager.record(found("appeared", block(1.35, 0.8, size=1.0), 10, 60), finding(2))
 
 
+BOX = np.array([-50.0, -50.0, -5.0]), np.array([50.0, 50.0, 5.0])
+
+
+def seen_at(stamps_s, session=1):
+    """A submap of scans that each saw the bag at (3, 4) and a wall at (6, 4): it, and the scans' sessions."""
+    shot = np.vstack([block(3, 4), block(6, 4, size=1.0)])
+    scan = np.repeat(np.arange(len(stamps_s), dtype=np.int16), len(shot))
+    stamps = np.array(stamps_s) * S
+    submap = Submap(np.vstack([shot] * len(stamps_s)), scan, [], np.ones(len(stamps_s)), stamps)
+    return submap, np.full(len(stamps_s), session)
+
+
 def test_a_removed_object_is_erased_from_older_scans_only(store):
     manager, bag, wall = ChangeManager(store), block(3, 4), block(6, 4, size=1.0)
     manager.record(found("disappeared", bag, 50, 60), finding(2))
-    points = np.vstack([bag, bag, wall])
-    taken = np.repeat([[1, 20 * S], [1, 80 * S], [1, 20 * S]], [len(bag), len(bag), len(wall)], axis=0)
-    stands = manager.update_map(points, taken, 1, (1, 100 * S))
-    assert not stands[: len(bag)].any()
-    assert stands[len(bag) :].all()
+    submap = update_map(*seen_at([20, 80]), manager.erasures(1, BOX, (1, 100 * S)))
+    assert np.bincount(submap.scan).tolist() == [len(wall), len(bag) + len(wall)]
 
 
 def test_what_was_not_yet_known_at_the_time_is_not_erased(store):
-    manager, bag = ChangeManager(store), block(3, 4)
+    manager, bag, wall = ChangeManager(store), block(3, 4), block(6, 4, size=1.0)
     manager.record(found("disappeared", bag, 50, 60), finding(2))
-    taken = np.tile([1, 20 * S], (len(bag), 1))
-    assert manager.update_map(bag, taken, 1, (1, 55 * S)).all()
-    assert not manager.update_map(bag, taken, 1, (2, 5 * S)).any()  # a later session, whose clock began anew
+    assert len(update_map(*seen_at([20]), manager.erasures(1, BOX, (1, 55 * S))).points) == len(bag) + len(wall)
+    # A later session, whose clock began anew.
+    assert len(update_map(*seen_at([20]), manager.erasures(1, BOX, (2, 5 * S))).points) == len(wall)
 
 
 def test_planners_get_the_list_without_points_above_a_size(store):

@@ -3,14 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
+import plain
 import pytest
 from scipy.spatial.distance import cdist
+from stored import make_scan, pose
 
 from revisitd.daemon.detection.candidates import changed, dense_enough
 from revisitd.daemon.detection.clusters import cluster, thin
 from revisitd.daemon.detection.ground import is_ground_like, segment_ground
 from revisitd.daemon.detection.occlusion import persistent, sight
 from revisitd.daemon.detection.submap import Submap, depth_image
+from revisitd.daemon.submap_build import scan_view
+from revisitd.drivers.metadata import sensor_from_metadata
+from revisitd.drivers.virtual.sensor import virtual_metadata
 
 ALTITUDES = np.radians(np.linspace(22.5, -22.5, 64)).astype(np.float32)
 
@@ -55,6 +60,27 @@ def test_thinning_keeps_one_point_for_each_voxel():
     assert thin(points).tolist() == [0, 2, 3]
 
 
+def test_a_stored_scan_becomes_the_points_and_the_depth_image_of_the_plain_version():
+    sensor = sensor_from_metadata(virtual_metadata(32, 512))
+    range_mm = np.random.default_rng(2).integers(0, 40_000, sensor.shape).astype(np.uint32)
+    range_mm[range_mm < 3000] = 0
+    column_valid = np.arange(512) % 50 != 7
+    column_ns = np.where(column_valid, 10**9 + np.arange(512) * 195_000, 0)
+    T_start_end = pose(0.2, 0.03, 0.01, yaw=0.05)
+    scan = make_scan(
+        range_mm=range_mm, column_valid=column_valid, column_ns=column_ns, T_start_end=T_start_end,
+        T_map_sensor=pose(30.0, -20.0, 1.0, yaw=2.0),
+    )  # fmt: skip
+    _, points, image = scan_view(scan, sensor, 25.0)
+    _, expected, expected_image = plain.scan_view(scan, sensor, 25.0)
+    np.testing.assert_allclose(points, expected, atol=1e-3)
+    same = np.isclose(image.nearest, expected_image.nearest, atol=1e-3, equal_nan=True)
+    assert same.mean() > 0.999  # a point on a pixel's rim may fall to either side
+    looks = [look(points) for look in (image.look_at, lambda p: plain.look_at(expected_image, p))]
+    assert np.isclose(looks[0][0], looks[1][0], atol=1e-3).all()
+    assert np.isclose(looks[0][1], looks[1][1], atol=1e-3, equal_nan=True).mean() > 0.99
+
+
 # Ground ---------------------------------------------------------------------------------------------------------
 
 
@@ -88,6 +114,12 @@ def test_ground_is_found_on_slopes_and_under_a_tilted_sensor(slope, tilt):
     assert is_ground[kind == 0].mean() > 0.98
     assert is_ground[kind == 1].mean() < 0.12  # the lowest decimetre of walls and sills looks like ground
     assert is_ground[kind == 2].mean() < 0.45
+
+
+def test_the_ground_is_that_of_the_plain_version_but_for_the_rims_of_bins():
+    points, _ = world(0.05)
+    is_ground, _ = segment_ground(points, np.zeros(2), 3.0, 0.035)
+    assert (is_ground == plain.segment_ground(points, np.zeros(2), 3.0, 0.035)[0]).mean() > 0.998
 
 
 def test_no_ground_is_invented_without_points_for_it():

@@ -9,7 +9,7 @@ import pytest
 
 from revisitd.daemon.comparison import Job, Selection
 from revisitd.daemon.config import Config
-from revisitd.daemon.detection.detector import Thresholds
+from revisitd.daemon.detection.results import Thresholds
 from revisitd.daemon.detection_process import ComparisonFailed, DetectionProcess
 from revisitd.daemon.worker import DetectionWorker, Instance
 from revisitd.storage.store import Store

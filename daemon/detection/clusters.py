@@ -7,8 +7,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from .candidates import cells
-
 VOXEL_M = 0.05  # objects are counted and stored at one point for each voxel: overlapping scans do not add points
 
 
@@ -16,7 +14,11 @@ def thin(points: np.ndarray) -> np.ndarray:
     """Indices (M,) of one point for each voxel: the first in the order given."""
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
-    return np.sort(np.unique(cells(points, VOXEL_M, np.zeros(3, dtype=points.dtype)), return_index=True)[1])
+    voxel = np.floor(points / np.float32(VOXEL_M)).astype(np.int64)
+    voxel -= voxel.min(axis=0)
+    size = voxel.max(axis=0) + 1
+    key = (voxel[:, 0] * size[1] + voxel[:, 1]) * size[2] + voxel[:, 2]
+    return np.sort(np.unique(key, return_index=True)[1])
 
 
 def cluster(points: np.ndarray, distance_m: float) -> np.ndarray:

@@ -2,73 +2,34 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..stopwatch import Stopwatch
 from .candidates import changed, dense_enough
 from .clusters import cluster, thin
 from .ground import Ground, is_ground_like, segment_ground
 from .occlusion import latest_sight, persistent, scans_looking_through
+from .results import DetectedObject, Detection, Thresholds
 from .submap import Submap
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """The detector's parameters; names, units and sources as in the settings' section [detection]."""
-
-    tau_m: float
-    n: int
-    rho_m: float
-    ground_sigmas: float
-    ground_min_sigma_m: float
-    occlusion_range_m: float
-    occlusion_margin_m: float
-    min_confirming_scans: int
-    min_showing_scans: int
-    min_showing_s: float
-    cluster_distance_m: float
-    min_points: int
-    ground_filter_c1_m: float
-    ground_filter_c2: float
-
-
-@dataclass(frozen=True, eq=False)
-class DetectedObject:
-    """One change: its points (N, 3) float32 map frame, one for each 5 cm voxel, and the evidence for it."""
-
-    polarity: str  # "appeared" or "disappeared"
-    points: np.ndarray
-    before_ns: int  # last scan that showed the old state
-    after_ns: int  # first scan that showed the new one
-    n_confirmed: int  # points whose place the other visit looked through
-    n_seen_by: int  # scans of its own submap that saw it
-    n_confirming: int  # scans of the other submap that looked through its place
-
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """Result of one instance: the objects, points left after each step, and seconds for each step."""
-
-    objects: list[DetectedObject]
-    n_candidates: int
-    n_confirmed: int
-    seconds: dict[str, float]
-
-
 def detect(cumulative: Submap, recent: Submap, thresholds: Thresholds) -> Detection:
     """Changes of the recent submap against the cumulative one: what appeared and what disappeared."""
-    watch = Stopwatch()
-    standing_c, ground_c = _without_ground(cumulative, thresholds)
-    standing_r, ground_r = _without_ground(recent, thresholds)
-    watch.lap("ground")
-    appeared = _one_way("appeared", standing_r, standing_c, ground_c, thresholds, watch)
-    disappeared = _one_way("disappeared", standing_c, standing_r, ground_r, thresholds, watch)
+    t, watch = thresholds, Stopwatch()
+    with ThreadPoolExecutor(2, thread_name_prefix="detect") as pool:  # the compiled loops run without the lock
+        (standing_c, ground_c), (standing_r, ground_r) = pool.map(without_ground, (cumulative, recent), (t, t))
+        watch.lap("ground")
+        new, old = standing_r.points, standing_c.points
+        is_new, is_old = pool.map(changed, (new, old), (old, new), (t.tau_m,) * 2, (t.n,) * 2)
+        watch.lap("neighbours")
+    appeared = _one_way("appeared", standing_r.only(is_new), standing_c, ground_c, t, watch)
+    disappeared = _one_way("disappeared", standing_c.only(is_old), standing_r, ground_r, t, watch)
     return Detection(
         appeared.objects + disappeared.objects,
         appeared.n_candidates + disappeared.n_candidates,
@@ -77,21 +38,8 @@ def detect(cumulative: Submap, recent: Submap, thresholds: Thresholds) -> Detect
     )
 
 
-class Stopwatch:
-    """Seconds spent since the last lap, summed by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """Book the time since the last lap under a name."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now
-
-
-def _without_ground(submap: Submap, t: Thresholds) -> tuple[Submap, Ground]:
+def without_ground(submap: Submap, t: Thresholds) -> tuple[Submap, Ground]:
+    """A submap's points that are not ground, and the ground."""
     centre = np.mean([-image.T_sensor_map[:3, :3].T @ image.T_sensor_map[:3, 3] for image in submap.images], axis=0)
     is_ground, ground = segment_ground(submap.points, centre[:2], t.ground_sigmas, t.ground_min_sigma_m)
     return submap.only(~is_ground), ground
@@ -100,12 +48,10 @@ def _without_ground(submap: Submap, t: Thresholds) -> tuple[Submap, Ground]:
 def _one_way(
     polarity: str, this: Submap, other: Submap, other_ground: Ground, t: Thresholds, watch: Stopwatch
 ) -> Detection:
-    """Objects that stand in this submap and not in the other."""
-    candidate = np.flatnonzero(changed(this.points, other.points, t.tau_m, t.n))
-    watch.lap("neighbours")
-    candidate = candidate[dense_enough(this.points[candidate], t.rho_m, t.n)]
+    """Objects among the candidate points of this submap that the other one could have seen and did not."""
+    this = this.only(dense_enough(this.points, t.rho_m, t.n))
     watch.lap("noise")
-    points, scan = this.points[candidate], this.scan[candidate]
+    points, scan = this.points, this.scan
     sight_limits = (t.occlusion_margin_m, t.occlusion_range_m)
     seen = latest_sight(points, other, *sight_limits, t.min_confirming_scans)
     confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
@@ -135,7 +81,7 @@ def _one_way(
             )
         )
     watch.lap("clusters")
-    return Detection(objects, len(candidate), int(confirmed.sum()), watch.seconds)
+    return Detection(objects, len(points), int(confirmed.sum()), watch.seconds)
 
 
 def _objects(points: np.ndarray, confirmed: np.ndarray, possible: np.ndarray, distance_m: float) -> list[np.ndarray]:

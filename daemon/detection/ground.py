@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from .arrays import bounds
+from .jit import kernel
+
 BIN_M = 2.5  # ring width and arc length of a bin: kerbs and slopes stay within a plane's spread
 MAX_RADIUS_M = 60.0
 CELL_M = 0.25  # planes are fitted to one low point for each cell: a bag's many returns weigh no more than its place
@@ -54,23 +57,26 @@ def segment_ground(
     """Which points (N, 3) float32 (map frame, z roughly up) are ground, and the planes that say so.
 
     A point is ground if its Mahalanobis distance along the plane's normal is below `sigmas`; whatever lies under
-    the plane is ground too (reflections in water). centre (2,): where the polar bins are centred.
-    Returns labels (N,) bool and the Ground.
+    the plane is ground too (reflections in water). centre (2,): where the polar bins are centred; a bin's rim is
+    drawn in cells of CELL_M. Returns labels (N,) bool and the Ground.
     """
-    bins, n_bins = _polar_bins(points, centre)
-    low = _low_points(points)
-    ground = _consistent(_fit_planes(low, _polar_bins(low, centre)[0], n_bins))
+    if len(points) == 0:
+        return np.zeros(0, dtype=bool), _ground(*np.zeros((4, 0, 3)))
+    lower, upper = bounds(points)
+    corner, n_cells = lower[:2], ((upper - lower)[:2] / np.float32(CELL_M)).astype(np.int64) + 1
+    cell, low = _low_points(points, corner, n_cells)
+    bins, n_bins = _polar_bins(low, centre)
+    ground = _consistent(_fit_planes(low, bins, n_bins))
     if not len(ground.mean):
         return np.zeros(len(points), dtype=bool), ground
-    # One plane for each bin, looked up by bin: a tree query for each of a million points would cost a second.
-    centres = _bin_centres(points, bins, n_bins)
-    plane_of_bin, known = ground.nearest(centres)
-    normal = ground.normal[plane_of_bin].astype(np.float32)
-    mean = ground.mean[plane_of_bin]
-    limit = np.where(known, sigmas * np.maximum(ground.sigma[plane_of_bin], min_sigma_m), -np.inf).astype(np.float32)
-    level = (normal * mean).sum(axis=1).astype(np.float32)
-    height = np.einsum("ij,ij->i", points, normal[bins]) - level[bins]
-    return height < limit[bins], ground
+    # One plane for each bin, looked up by cell: a tree query for each of a million points would cost a second.
+    plane_of_bin, known = ground.nearest(_bin_centres(low, bins, n_bins))
+    normal = ground.normal[plane_of_bin]
+    level = (normal * (ground.mean[plane_of_bin] - [*corner, 0.0])).sum(axis=1)
+    limit = np.where(known, level + sigmas * np.maximum(ground.sigma[plane_of_bin], min_sigma_m), -np.inf)
+    planes = np.full((n_cells.prod(), 4), -np.inf, dtype=np.float32)
+    planes[cell] = np.column_stack([normal, limit])[bins]
+    return _under(points, corner, n_cells[1], planes), ground
 
 
 def is_ground_like(points: np.ndarray, ground: Ground, c1_m: float, c2: float) -> bool:
@@ -111,20 +117,46 @@ def _bin_centres(points: np.ndarray, bins: np.ndarray, n_bins: int) -> np.ndarra
     return np.stack([np.bincount(bins, points[:, i], n_bins) / count for i in range(2)], axis=1)
 
 
-def _low_points(points: np.ndarray) -> np.ndarray:
-    """One point (M, 3) for each cell of the plane that holds returns: the mean of its lowest ones."""
-    index = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / np.float32(CELL_M)).astype(np.int64)
-    width = int(index[:, 1].max()) + 1
-    cell = index[:, 0] * width + index[:, 1]
-    n_cells = (int(index[:, 0].max()) + 1) * width
-    lowest = np.full(n_cells, np.inf, dtype=np.float32)
-    np.minimum.at(lowest, cell, points[:, 2])
-    keep = points[:, 2] < lowest[cell] + np.float32(CELL_DEPTH_M)
-    cell, kept = cell[keep], points[keep]
-    count = np.bincount(cell, minlength=n_cells)
-    filled = count > 0
-    sums = np.stack([np.bincount(cell, kept[:, i], n_cells)[filled] for i in range(3)], axis=1)
-    return sums / count[filled, None]
+def _low_points(points: np.ndarray, corner: np.ndarray, n_cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The cells (M,) that hold returns, and one point (M, 3) for each: the mean of its lowest ones."""
+    count, sums = _low_sums(points, corner, n_cells[0], n_cells[1])
+    cell = np.flatnonzero(count)
+    return cell, sums[cell] / count[cell, None]
+
+
+@kernel
+def _cell(point, corner, width):
+    per_m = np.float32(1.0 / CELL_M)
+    return np.int64((point[0] - corner[0]) * per_m) * width + np.int64((point[1] - corner[1]) * per_m)
+
+
+@kernel
+def _low_sums(points, corner, height, width):
+    """Number and sum of the returns in each cell that lie within CELL_DEPTH_M of its lowest one."""
+    lowest = np.full(height * width, np.inf, np.float32)
+    for i in range(len(points)):
+        cell = _cell(points[i], corner, width)
+        lowest[cell] = min(lowest[cell], points[i, 2])
+    count = np.zeros(height * width, np.int64)
+    sums = np.zeros((height * width, 3), np.float64)
+    for i in range(len(points)):
+        cell = _cell(points[i], corner, width)
+        if points[i, 2] < lowest[cell] + np.float32(CELL_DEPTH_M):
+            count[cell] += 1
+            for axis in range(3):
+                sums[cell, axis] += points[i, axis]
+    return count, sums
+
+
+@kernel
+def _under(points, corner, width, planes):
+    """Which points lie under their cell's limit; planes (cells, 4): normal, and limit along it from the corner."""
+    out = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        plane = planes[_cell(points[i], corner, width)]
+        height = (points[i, 0] - corner[0]) * plane[0] + (points[i, 1] - corner[1]) * plane[1] + points[i, 2] * plane[2]
+        out[i] = height < plane[3]
+    return out
 
 
 def _fit_planes(points: np.ndarray, bins: np.ndarray, n_bins: int) -> Ground:
