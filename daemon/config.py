@@ -86,7 +86,7 @@ class SubmapConfig(_Section):
 
 
 class AlignmentConfig(_Section):
-    """Registration of a visit's scans to the scene's first visit (GICP, small_gicp)."""
+    """Registration of key scans to the scene's first visit, and to the key scans before (GICP, small_gicp)."""
 
     voxel_m: float = Field(0.25, gt=0, description="voxel of both clouds")
     range_m: float = Field(40.0, gt=0, description="returns farther away are not registered")
@@ -95,6 +95,10 @@ class AlignmentConfig(_Section):
     drift_ratio: float = Field(
         0.01, ge=0, description="drift expected per metre since the last fix: how far out a scene is looked for"
     )
+    local_voxel_m: float = Field(
+        0.5, gt=0, description="in a new place: voxel of the last key scans' map (halves KISS-ICP's error by study)"
+    )
+    local_scans: int = Field(40, ge=2, description="key scans that this map remembers: 20 m of path")
     min_inlier_ratio: float = Field(0.6, gt=0, le=1, description="share of the scan that must find a partner")
     max_residual_m: float = Field(
         0.12, gt=0, description="root mean square distance to the reference's surface, at most"

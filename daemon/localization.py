@@ -1,4 +1,4 @@
-"""Corrects odometry by the stored scenes: T_map_odom, by registering key scans to a scene's first visit."""
+"""Corrects odometry: T_map_odom, by registering key scans to a scene's first visit, or to the key scans before."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import small_gicp
 
 from .config import AlignmentConfig
 from .geometry import inverse, rotation_angle_rad, transform
+from .local_map import LocalMap
 from .scenes import Scene
 
 CACHED_REFERENCES = 3  # scenes overlap at their rims; more than that are never in play at once
 MAX_TURN_DEG = 8.0  # a correction that turns the map further is a wrong match, not drift
+SCAN_VOXEL_RATIO = 1.6  # a scan is thinner than the reference it is registered to
+MAX_SEAM_M = 0.1  # a fix that moves the map further leaves the last key scans where they are no longer true
 MIN_COARSE_TRAVEL_M = 5.0  # metres without a fix before a large drift is looked for
 
 
@@ -45,6 +48,7 @@ class Localizer:
         self._config = config
         self._load_reference = load_reference
         self._references: OrderedDict[int, tuple[small_gicp.PointCloud, small_gicp.KdTree]] = OrderedDict()
+        self._local_map = LocalMap(config.local_voxel_m, config.local_scans)
         self._last_position: np.ndarray | None = None
         self._travel_since_fix_m = 0.0
         self.T_map_odom = T_map_odom
@@ -64,16 +68,25 @@ class Localizer:
         scenes: the known scenes that the robot may be in, nearest first; without one the prediction stands.
         """
         self._travel(T_odom_sensor)
-        predicted = self.predict(T_odom_sensor)
+        near = points[(points**2).sum(axis=1) < self._config.range_m**2].astype(np.float64)
+        source, _ = small_gicp.preprocess_points(near, self._config.voxel_m * SCAN_VOXEL_RATIO, 10, 1)
+        fix = self._fix(source, self.predict(T_odom_sensor), scenes)
+        self._local_map.add(source, fix.T_map_sensor)
+        self.T_map_odom = fix.T_map_sensor @ inverse(T_odom_sensor)
+        return fix
+
+    def _fix(self, source: small_gicp.PointCloud, predicted: np.ndarray, scenes: list[Scene]) -> Fix:
+        """By a known scene; where none matches, by the key scans before."""
         reason = "new place"
         for scene in scenes[:2]:
-            match = self._register(points, predicted, scene)
+            match = self._register(source, predicted, scene)
             reason = self._objection(match, predicted)
             if not reason:
-                self.T_map_odom = match.T_map_sensor @ inverse(T_odom_sensor)
                 self._travel_since_fix_m = 0.0
+                if np.linalg.norm(match.T_map_sensor[:3, 3] - predicted[:3, 3]) > MAX_SEAM_M:
+                    self._local_map.clear()
                 return Fix(match.T_map_sensor, True, match.residual_m, "")
-        return Fix(predicted, False, float("nan"), reason)
+        return Fix(self._local_map.refine(source, predicted), False, float("nan"), reason)
 
     def _travel(self, T_odom_sensor: np.ndarray) -> None:
         position = T_odom_sensor[:3, 3].copy()
@@ -81,9 +94,7 @@ class Localizer:
             self._travel_since_fix_m += float(np.linalg.norm(position - self._last_position))
         self._last_position = position
 
-    def _register(self, points: np.ndarray, predicted: np.ndarray, scene: Scene) -> _Match:
-        near = points[(points**2).sum(axis=1) < self._config.range_m**2].astype(np.float64)
-        source, _ = small_gicp.preprocess_points(near, self._config.voxel_m * 1.6, 10, 1)
+    def _register(self, source: small_gicp.PointCloud, predicted: np.ndarray, scene: Scene) -> _Match:
         gates = [self._config.gate_m]
         if self._travel_since_fix_m > MIN_COARSE_TRAVEL_M:
             gates = [self._config.coarse_gate_m, *gates]

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..stopwatch import Stopwatch
+from .arrays import bounds, inside
 from .candidates import changed, dense_enough
 from .clusters import cluster, thin
 from .ground import Ground, is_ground_like, segment_ground
@@ -16,6 +17,10 @@ from .results import DetectedObject, Detection, Thresholds
 from .submap import Submap
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
+COMPLETE_M = 1.0  # ... and by looked-through points of any distance, so far around them,
+COMPLETE_STEP_M = 0.2  # without a gap wider than this
+COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
+COUNTERPART_SHARE = 0.2  # also against the size of what came
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
 
@@ -28,10 +33,13 @@ def detect(cumulative: Submap, recent: Submap, thresholds: Thresholds) -> Detect
         new, old = standing_r.points, standing_c.points
         is_new, is_old = pool.map(changed, (new, old), (old, new), (t.tau_m,) * 2, (t.n,) * 2)
         watch.lap("neighbours")
-    appeared = _one_way("appeared", standing_r.only(is_new), standing_c, ground_c, t, watch)
-    disappeared = _one_way("disappeared", standing_c.only(is_old), standing_r, ground_r, t, watch)
+    appeared = _one_way("appeared", standing_r, is_new, standing_c, ground_c, t, watch)
+    disappeared = _one_way("disappeared", standing_c, is_old, standing_r, ground_r, t, watch)
+    left = _counterparts(appeared.objects, disappeared.objects, "disappeared", standing_c, standing_r, ground_r, t)
+    taken = _counterparts(disappeared.objects, appeared.objects, "appeared", standing_r, standing_c, ground_c, t)
+    watch.lap("clusters")
     return Detection(
-        appeared.objects + disappeared.objects,
+        appeared.objects + disappeared.objects + left + taken,
         appeared.n_candidates + disappeared.n_candidates,
         appeared.n_confirmed + disappeared.n_confirmed,
         watch.seconds,
@@ -46,42 +54,126 @@ def without_ground(submap: Submap, t: Thresholds) -> tuple[Submap, Ground]:
 
 
 def _one_way(
-    polarity: str, this: Submap, other: Submap, other_ground: Ground, t: Thresholds, watch: Stopwatch
+    polarity: str,
+    standing: Submap,
+    is_far: np.ndarray,
+    other: Submap,
+    other_ground: Ground,
+    t: Thresholds,
+    watch: Stopwatch,
 ) -> Detection:
-    """Objects among the candidate points of this submap that the other one could have seen and did not."""
+    """Objects among the points of one submap that are far from the other's, which could have seen them and did not."""
+    this = standing.only(is_far)
     this = this.only(dense_enough(this.points, t.rho_m, t.n))
     watch.lap("noise")
-    points, scan = this.points, this.scan
+    confirmed, possible = _evidence(this, other, t)
+    watch.lap("occlusion")
+    objects = []
+    for member in _objects(this.points, confirmed, possible, t.cluster_distance_m):
+        kept = member[thin(this.points[member])]
+        sure = kept[confirmed[kept]]
+        if len(sure) < max(t.min_points, MIN_CONFIRMED_SHARE * len(kept)):
+            continue
+        if len(np.unique(this.scan[member])) < t.min_showing_scans:
+            continue
+        if is_ground_like(this.points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
+            continue
+        found = _described(polarity, this, member, sure, _completion(this.points[sure], standing, other, t), other, t)
+        if found is not None:
+            objects.append(found)
+    watch.lap("clusters")
+    return Detection(objects, len(this.points), int(confirmed.sum()), watch.seconds)
+
+
+def _evidence(this: Submap, other: Submap, t: Thresholds) -> tuple[np.ndarray, np.ndarray]:
+    """Which points (N,) stayed through their own visit and were looked through by the other; which may have been."""
     sight_limits = (t.occlusion_margin_m, t.occlusion_range_m)
-    seen = latest_sight(points, other, *sight_limits, t.min_confirming_scans)
+    seen = latest_sight(this.points, other, *sight_limits, t.min_confirming_scans)
     confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
     possible = confirmed | (seen.at <= seen.through)
     possible[possible] = persistent(
-        points[possible], scan[possible], this, *sight_limits, t.min_showing_scans, t.min_showing_s
+        this.points[possible], this.scan[possible], this, *sight_limits, t.min_showing_scans, t.min_showing_s
     )
-    confirmed &= possible
-    watch.lap("occlusion")
-    objects = []
-    for member in _objects(points, confirmed, possible, t.cluster_distance_m):
-        kept = member[thin(points[member])]
-        own_scans = np.unique(scan[member])
-        sure = kept[confirmed[kept]]
-        if len(sure) < max(t.min_points, MIN_CONFIRMED_SHARE * len(kept)) or len(own_scans) < t.min_showing_scans:
+    return confirmed & possible, possible
+
+
+def _completion(sure: np.ndarray, standing: Submap, other: Submap, t: Thresholds) -> np.ndarray:
+    """Points (M, 3) around an object's confirmed ones that were looked through too, however near to what stands there.
+
+    A door that closes a car, a bag against a wall: most of it lies within tau of what stays. Its own distance says
+    nothing, but the beams that went through its place do; beside an object that is sure they are believed.
+    """
+    near = _looked_through_around(sure, standing, other, t)
+    if not len(near.points):
+        return near.points
+    label = cluster(np.concatenate([sure, near.points]), COMPLETE_STEP_M)
+    return near.points[np.isin(label[len(sure) :], label[: len(sure)])]
+
+
+def _counterparts(
+    found: list[DetectedObject],
+    known: list[DetectedObject],
+    polarity: str,
+    standing: Submap,
+    other: Submap,
+    other_ground: Ground,
+    t: Thresholds,
+) -> list[DetectedObject]:
+    """What left the place beside a thing that came, or came where one left, and is within tau of what stays there.
+
+    A door that opens is gone from its frame, but nearly all of the frame is still within tau of it: no candidates to
+    begin with. Where a change is sure, the beams that went through its counterpart's place are believed alone.
+    """
+    counterparts = []
+    for change in found:
+        near = _looked_through_around(change.points, standing, other, t)
+        for old in known + counterparts:
+            near = near.only(changed(near.points, old.points, t.tau_m, 1))
+        if not len(near.points):
             continue
-        if is_ground_like(points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
-            continue
-        through = scans_looking_through(points[sure], other.images, *sight_limits)
-        if len(through) < t.min_confirming_scans:
-            continue
-        own_ns, other_ns = this.stamp_ns[own_scans], other.stamp_ns[through]
-        before, after = (other_ns, own_ns) if polarity == "appeared" else (own_ns, other_ns)
-        objects.append(
-            DetectedObject(
-                polarity, points[kept], int(before.max()), int(after.min()), len(sure), len(own_scans), len(through)
-            )
-        )
-    watch.lap("clusters")
-    return Detection(objects, len(points), int(confirmed.sum()), watch.seconds)
+        label = cluster(near.points, COMPLETE_STEP_M)
+        least = max(COUNTERPART_POINTS, COUNTERPART_SHARE * len(change.points))
+        for i in np.flatnonzero(np.bincount(label) >= least):
+            member = np.flatnonzero(label == i)
+            if is_ground_like(near.points[member], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
+                continue
+            described = _described(polarity, near, member, member, near.points[:0], other, t)
+            counterparts += [described] if described else []
+    return counterparts
+
+
+def _looked_through_around(points: np.ndarray, standing: Submap, other: Submap, t: Thresholds) -> Submap:
+    """The part of a submap around some points that the other one looked through, one point for each voxel."""
+    lower, upper = bounds(points)
+    reach = np.float32(COMPLETE_M)
+    near = standing.only(inside(standing.points, lower - reach, upper + reach))
+    near = near.only(_first_of_voxels(near.points))
+    return near.only(_evidence(near, other, t)[0])
+
+
+def _described(
+    polarity: str, this: Submap, member: np.ndarray, sure: np.ndarray, more: np.ndarray, other: Submap, t: Thresholds
+) -> DetectedObject | None:
+    """An object with its evidence; None where no two scans of the other submap look through enough of it."""
+    through = scans_looking_through(this.points[sure], other.images, t.occlusion_margin_m, t.occlusion_range_m)
+    if len(through) < t.min_confirming_scans:
+        return None
+    own_scans = np.unique(this.scan[member])
+    own_ns, other_ns = this.stamp_ns[own_scans], other.stamp_ns[through]
+    before, after = (other_ns, own_ns) if polarity == "appeared" else (own_ns, other_ns)
+    # The confirmed ones first: of each voxel the first point stays.
+    points = np.concatenate([this.points[sure], more, this.points[member]])
+    kept = thin(points)
+    n_confirmed = int((kept < len(sure) + len(more)).sum())
+    return DetectedObject(
+        polarity, points[kept], int(before.max()), int(after.min()), n_confirmed, len(own_scans), len(through)
+    )
+
+
+def _first_of_voxels(points: np.ndarray) -> np.ndarray:
+    first = np.zeros(len(points), dtype=bool)
+    first[thin(points)] = True
+    return first
 
 
 def _objects(points: np.ndarray, confirmed: np.ndarray, possible: np.ndarray, distance_m: float) -> list[np.ndarray]:
