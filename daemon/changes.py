@@ -8,9 +8,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..storage.changes import Change, ChangeObject, ChangeStore
-from .detection.results import ERASE_M, DetectedObject, Erasure
+from .detection.results import ERASE_M, DetectedObject, Erasure, KnownChange, KnownState
 
 TOUCH_M = 0.4  # objects nearer than the cluster distance are one
+MIN_SEEN_SHARE = 0.25  # of a known change's points; a visit that saw less of it says nothing
+UNDONE_SHARE = 0.8  # of what was seen; leaves and pose errors undo a fifth of anything
 MIN_TOUCH_SHARE = 0.15  # ... if so much of the smaller one touches: neighbours that graze each other stay two
 
 
@@ -43,7 +45,7 @@ class ChangeManager:
         """
         touching = self._touching(found.points, finding.map_id)
         confidence, evidence = _confidence(found), _evidence(found)
-        same = [change for change in touching if change.polarity == found.polarity]
+        same = [change for change in touching if change.polarity == found.polarity and change.state == "present"]
         if same:
             known = max(same, key=lambda change: change.n_points)
             if known.session == finding.session and found.before_ns < known.first_seen_ns:
@@ -75,15 +77,48 @@ class ChangeManager:
         )
         return [Erasure(change.points, change.session, change.first_seen_ns) for change in gone]
 
+    def known(
+        self, map_id: int, box: tuple[np.ndarray, np.ndarray], before: tuple[int, int]
+    ) -> list[KnownChange]:
+        """Changes in a box that hold, first seen before a time (session, sensor time): what a visit is asked about."""
+        held = self._store.changes(map_id=map_id, box=box, before=before)
+        return [KnownChange(c.id, c.polarity, c.points) for c in held if c.state == "present"]
+
+    def note(self, states: list[KnownState], finding_of: dict[str, int], time_ns: int) -> None:
+        """Write down what a visit (finding_of: session, scene, visit) saw of the changes known before it.
+
+        What the detection of the same visit found to have ended, or found again, has its entry already. One whose
+        place is seen to be as before, though too little of it for a change of its own, has ended too.
+        """
+        for state in states:
+            change = self._store.get(state.change_id, with_points=False)
+            last = self._store.history(state.change_id)[-1]
+            same_visit = all(last[f"{key}_id" if key != "visit" else key] == value for key, value in finding_of.items())
+            if change.state != "present" or same_visit:
+                continue
+            kind, shares = _seen_as(state), (state.share_still, state.share_undone)
+            # That a neighbouring scene does not see a thing is no news; that its own does not, is.
+            if kind != "unseen" or change.scene == finding_of["scene"]:
+                self._store.observe(state.change_id, kind, **finding_of, time_ns=time_ns, shares=shares)
+
     def _touching(self, points: np.ndarray, map_id: int) -> list[ChangeObject]:
-        """Changes that hold (nothing undid them) and share their place with the points."""
+        """Changes that no other change undid and that share their place with the points."""
         box = points.min(axis=0) - TOUCH_M, points.max(axis=0) + TOUCH_M
         near = self._store.changes(map_id=map_id, box=box)
-        return [c for c in near if c.state == "present" and _touch_share(c.points, points) >= MIN_TOUCH_SHARE]
+        return [c for c in near if c.superseded_by is None and _touch_share(c.points, points) >= MIN_TOUCH_SHARE]
 
     def _observe(self, change: ChangeObject, kind: str, found: DetectedObject, finding: Finding, **more: int) -> None:
         where = {"session": finding.session, "scene": finding.scene, "visit": finding.visit}
         self._store.observe(change.id, kind, **where, time_ns=found.after_ns, **more)
+
+
+def _seen_as(state: KnownState) -> str:
+    seen = state.share_still + state.share_undone
+    if seen < MIN_SEEN_SHARE:
+        return "unseen"
+    if state.share_undone >= UNDONE_SHARE * seen:
+        return "gone"
+    return "still" if state.share_still > state.share_undone else "unseen"
 
 
 def _touch_share(a: np.ndarray, b: np.ndarray) -> float:

@@ -17,6 +17,7 @@ from ..storage.scans import Scan, ScanStore
 from .comparison import Comparison, Job, ScanFacts, Selection
 from .detection.detector import detect
 from .detection.erasure import update_map
+from .detection.occlusion import state_of
 from .detection.submap import Submap
 from .sensors import Sensors
 from .stopwatch import Stopwatch
@@ -40,8 +41,12 @@ class Comparer:
         cumulative = update_map(cumulative, job.cumulative.session, job.erasures)
         watch.lap("update_map")
         detection = detect(cumulative, recent, job.thresholds)
+        watch.restart()
+        limits = job.thresholds.occlusion_margin_m, job.thresholds.occlusion_range_m
+        known = [state_of(change, recent.images, *limits) for change in job.known]
+        watch.lap("known")
         sizes = len(cumulative.points), len(recent.points)
-        return Comparison(detection, facts_c, facts_r, *sizes, {**watch.seconds, **detection.seconds})
+        return Comparison(detection, known, facts_c, facts_r, *sizes, {**watch.seconds, **detection.seconds})
 
     def load(self, selection: Selection, range_m: float) -> tuple[Submap, ScanFacts]:
         """The submap of some stored scans."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .detection.results import Detection, Erasure, Thresholds
+from .detection.results import Detection, Erasure, KnownChange, KnownState, Thresholds
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +25,7 @@ class Job:
     cumulative: Selection
     recent: Selection
     erasures: list[Erasure]  # removed objects, known before the visit
+    known: list[KnownChange]  # changes that held before the visit
     range_m: float
     thresholds: Thresholds
 
@@ -43,6 +44,7 @@ class Comparison:
     """What came of it."""
 
     detection: Detection
+    known: list[KnownState]  # what the visit saw of the job's known changes, in their order
     cumulative: ScanFacts
     recent: ScanFacts
     n_points_cumulative: int  # compared: within range, and not known to be gone

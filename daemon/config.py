@@ -40,7 +40,9 @@ class OdometryConfig(_Section):
     max_range_m: float = Field(80.0, gt=0, description="returns beyond are not registered; also the local map's radius")
     min_range_m: float = Field(1.0, ge=0, description="returns nearer are the robot itself")
     max_points: int = Field(
-        35_000, ge=1000, description="pixels given to KISS-ICP, a regular sub-grid of the image"
+        24_000,
+        ge=1000,
+        description="pixels given to KISS-ICP, a regular sub-grid of the image; key scans are refined by all of theirs",
     )
     max_speed_mps: float = Field(20.0, gt=0, description="faster is not believed: odometry is lost")
     max_turn_dps: float = Field(270.0, gt=0, description="turning faster is not believed: odometry is lost")

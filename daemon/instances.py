@@ -88,10 +88,12 @@ class ChangeDetection:
         recent = self._choose(index.scans_of_scene(instance.scene_id, visit=instance.visit))
         positions = cumulative.T_map_sensor[:, :3, 3]
         box = positions.min(axis=0) - range_m, positions.max(axis=0) + range_m
+        before = instance.session_id, instance.t_in_ns
         return Job(
             Selection(cumulative.session, cumulative.scan_id, cumulative.visit_number),
             Selection(recent.session, recent.scan_id, recent.visit_number),
-            self._manager.erasures(instance.map_id, box, (instance.session_id, instance.t_in_ns)),
+            self._manager.erasures(instance.map_id, box, before),
+            self._manager.known(instance.map_id, box, before),
             range_m,
             self._thresholds,
         )
@@ -113,6 +115,8 @@ class ChangeDetection:
             )
             n_new += self._manager.record(found, finding)
             _log(found, instance)
+        where = {"session": instance.session_id, "scene": instance.scene_id, "visit": instance.visit}
+        self._manager.note(comparison.known, where, instance.t_out_ns)
         return n_new
 
 

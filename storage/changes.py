@@ -133,13 +133,19 @@ class ChangeStore:
         visit: int,
         time_ns: int,
         superseded_by: int | None = None,
+        shares: tuple[float, float] | None = None,
     ) -> None:
-        """Note that a later visit saw the change: `still` there, or `gone` (undone), by which change if by one."""
+        """Note what a later visit saw of the change: `still` there, `gone` (undone; by which change, if by one), or
+        nothing (`unseen`: no news, so the change's revision stays).
+
+        shares: of its points, seen in its state and seen in the state before it.
+        """
         with self._db.transaction():
             self.get(change_id, with_points=False)
-            self._observe(change_id, kind, session=session, scene=scene, visit=visit, time_ns=time_ns)
-            ended = {"state": "ended", "superseded_by": superseded_by} if kind == "gone" else {}
-            self._update(change_id, ended)
+            where = {"session": session, "scene": scene, "visit": visit}
+            self._observe(change_id, kind, **where, time_ns=time_ns, shares=shares)
+            if kind != "unseen":
+                self._update(change_id, {"state": "ended", "superseded_by": superseded_by} if kind == "gone" else {})
 
     # Reading ------------------------------------------------------------------------------------------------------
 
@@ -184,9 +190,9 @@ class ChangeStore:
         return self.changes(min_points=n, with_points=False)
 
     def history(self, change_id: int) -> list[dict[str, Any]]:
-        """What the visits saw of a change, oldest first: kind, session_id, scene_id, visit, time_ns."""
+        """What the visits saw of a change, oldest first: kind, session_id, scene_id, visit, time_ns and the shares."""
         return self._db.rows(
-            """SELECT kind, session_id, scene_id, visit, time_ns FROM observations
+            """SELECT kind, session_id, scene_id, visit, time_ns, share_still, share_undone FROM observations
                WHERE change_id = ? ORDER BY observation_id""",
             (change_id,),
         )
@@ -200,7 +206,18 @@ class ChangeStore:
 
     # Parts of a transaction ---------------------------------------------------------------------------------------
 
-    def _observe(self, change_id: int, kind: str, *, session: int, scene: int, visit: int, time_ns: int) -> None:
+    def _observe(
+        self,
+        change_id: int,
+        kind: str,
+        *,
+        session: int,
+        scene: int,
+        visit: int,
+        time_ns: int,
+        shares: tuple[float, float] | None = None,
+    ) -> None:
+        share_still, share_undone = shares or (None, None)
         row = {
             "change_id": change_id,
             "kind": kind,
@@ -208,6 +225,8 @@ class ChangeStore:
             "scene_id": scene,
             "visit": visit,
             "time_ns": time_ns,
+            "share_still": share_still,
+            "share_undone": share_undone,
         }
         self._db.insert("observations", row)
 

@@ -162,5 +162,32 @@ SELECT o.change_id, c.polarity, o.kind AS seen_as, o.session_id, o.scene_id, o.v
 FROM observations AS o JOIN changes AS c ON c.id = o.change_id ORDER BY o.observation_id;
 """
 
+CHANGES_V2 = """
+CREATE TABLE observations_2 (          -- the history of each change: every visit to its place
+    observation_id INTEGER PRIMARY KEY AUTOINCREMENT,
+    change_id      INTEGER NOT NULL REFERENCES changes (id),
+    kind           TEXT NOT NULL CHECK (kind IN ('appeared', 'disappeared', 'still', 'gone', 'unseen')),
+                                       -- the first is the polarity; still: seen again so; gone: undone;
+                                       -- unseen: the visit did not see the place (hidden, out of view, no return)
+    session_id     INTEGER NOT NULL,
+    scene_id       INTEGER NOT NULL,
+    visit          INTEGER NOT NULL,
+    time_ns        INTEGER NOT NULL,   -- in session session_id
+    share_still    REAL,               -- of the change's points: seen in the state that the change left
+    share_undone   REAL                -- ... seen in the state before it; the rest was not seen. NULL: not asked
+) STRICT;
+INSERT INTO observations_2 SELECT observation_id, change_id, kind, session_id, scene_id, visit, time_ns, NULL, NULL
+    FROM observations;
+DROP VIEW change_history;
+DROP TABLE observations;
+ALTER TABLE observations_2 RENAME TO observations;
+CREATE INDEX observations_by_change ON observations (change_id);
+CREATE VIEW change_history AS          -- for people: which visit saw which change, in which state
+SELECT o.change_id, c.polarity, o.kind AS seen_as, o.session_id, o.scene_id, o.visit, o.time_ns,
+       round(o.share_still, 2) AS share_still, round(o.share_undone, 2) AS share_undone,
+       round(c.x, 2) AS x, round(c.y, 2) AS y, round(c.z, 2) AS z
+FROM observations AS o JOIN changes AS c ON c.id = o.change_id ORDER BY o.observation_id;
+"""
+
 INDEX_MIGRATIONS = (INDEX_V1,)
-CHANGES_MIGRATIONS = (CHANGES_V1,)
+CHANGES_MIGRATIONS = (CHANGES_V1, CHANGES_V2)

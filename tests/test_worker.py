@@ -69,7 +69,7 @@ def process(tmp_path):
 
 def job():
     scans = Selection(np.array([1]), np.array([7]), np.array([1]))
-    return Job(scans, scans, [], 25.0, Thresholds(**Config().detection.model_dump()))
+    return Job(scans, scans, [], [], 25.0, Thresholds(**Config().detection.model_dump()))
 
 
 def test_a_scan_that_is_gone_fails_the_comparison_and_is_named(process):

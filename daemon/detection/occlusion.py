@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .results import KnownChange, KnownState
 from .submap import DepthImage, Submap
 
 
@@ -80,3 +81,11 @@ def scans_looking_through(points: np.ndarray, images: list[DepthImage], margin_m
     """Indices of the scans that looked through at least a tenth of an object's points (N, 3)."""
     share = [sight(points, [image], margin_m, range_m).through.mean() for image in images]
     return np.flatnonzero(np.array(share) >= 0.1)
+
+
+def state_of(change: KnownChange, images: list[DepthImage], margin_m: float, range_m: float) -> KnownState:
+    """What the scans of a visit saw at the place of a known change: the thing, past its place, or neither."""
+    seen = sight(change.points, images, margin_m, range_m)
+    there, empty = seen.at > seen.through, seen.through > seen.at
+    still, undone = (there, empty) if change.polarity == "appeared" else (empty, there)
+    return KnownState(change.change_id, float(still.mean()), float(undone.mean()))

@@ -30,6 +30,24 @@ class Thresholds:
 
 
 @dataclass(frozen=True, eq=False)
+class KnownChange:
+    """A change that held before the visit: what does the visit see of it? points (N, 3) float32, map frame."""
+
+    change_id: int
+    polarity: str
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class KnownState:
+    """What a visit saw of a known change, as shares of its points; the rest it did not see."""
+
+    change_id: int
+    share_still: float  # in the state that the change left
+    share_undone: float  # in the state before it
+
+
+@dataclass(frozen=True, eq=False)
 class Erasure:
     """A removed object: points (N, 3) that older scans still show, and since when it is gone."""
 
