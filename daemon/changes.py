@@ -13,7 +13,7 @@ from .detection.results import ERASE_M, DetectedObject, Erasure, KnownChange, Kn
 TOUCH_M = 0.4  # objects nearer than the cluster distance are one
 MIN_SEEN_SHARE = 0.25  # of a known change's points; a visit that saw less of it says nothing
 UNDONE_SHARE = 0.8  # of what was seen; leaves and pose errors undo a fifth of anything
-MIN_TOUCH_SHARE = 0.15  # ... if so much of the smaller one touches: neighbours that graze each other stay two
+MIN_TOUCH_SHARE = 0.15  # ... in different intervals if so much of the smaller one touches: neighbours stay two
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,26 @@ class ChangeManager:
         """
         touching = self._touching(found.points, finding.map_id)
         confidence, evidence = _confidence(found), _evidence(found)
-        same = [change for change in touching if change.polarity == found.polarity and change.state == "present"]
-        if same:
-            known = max(same, key=lambda change: change.n_points)
-            if known.session == finding.session and found.before_ns < known.first_seen_ns:
-                # The same interval: another view of the same moment completes the object.
-                self._store.extend(known.id, found.points, max(confidence, known.confidence), evidence)
+        same = [(c, share) for c, share in touching if c.polarity == found.polarity and c.state == "present"]
+        # Of the same interval: another view of the same moment. However little of the two touches, they are one.
+        views = [c for c, _ in same if c.session == finding.session and found.before_ns < c.first_seen_ns]
+        if views:
+            views.sort(key=lambda change: -change.n_points)
+            known, parts = views[0], views[1:]
+            self._store.extend(known.id, found.points, max(confidence, known.confidence), evidence)
+            for part in parts:
+                self._store.merge(part.id, known.id)
             self._observe(known, "still", found, finding)
             return False
+        again = [c for c, share in same if share >= MIN_TOUCH_SHARE]
+        if again:
+            self._observe(max(again, key=lambda change: change.n_points), "still", found, finding)
+            return False
         change_id = self._store.add(_change(found, finding, confidence, evidence))
-        for other in touching:
+        for other, share in touching:
             # Only what was there before: a door that opens disappears here and appears beside in one interval.
-            if (other.session, other.first_seen_ns) <= (finding.before_session, found.before_ns):
+            older = (other.session, other.first_seen_ns) <= (finding.before_session, found.before_ns)
+            if older and share >= MIN_TOUCH_SHARE:
                 self._observe(other, "gone", found, finding, superseded_by=change_id)
         return True
 
@@ -101,11 +109,12 @@ class ChangeManager:
             if kind != "unseen" or change.scene == finding_of["scene"]:
                 self._store.observe(state.change_id, kind, **finding_of, time_ns=time_ns, shares=shares)
 
-    def _touching(self, points: np.ndarray, map_id: int) -> list[ChangeObject]:
-        """Changes that no other change undid and that share their place with the points."""
+    def _touching(self, points: np.ndarray, map_id: int) -> list[tuple[ChangeObject, float]]:
+        """Changes that no other change undid and that touch the points; and the share of the smaller that touches."""
         box = points.min(axis=0) - TOUCH_M, points.max(axis=0) + TOUCH_M
         near = self._store.changes(map_id=map_id, box=box)
-        return [c for c in near if c.superseded_by is None and _touch_share(c.points, points) >= MIN_TOUCH_SHARE]
+        shares = [(c, _touch_share(c.points, points)) for c in near if c.superseded_by is None]
+        return [(c, share) for c, share in shares if share > 0.0]
 
     def _observe(self, change: ChangeObject, kind: str, found: DetectedObject, finding: Finding, **more: int) -> None:
         where = {"session": finding.session, "scene": finding.scene, "visit": finding.visit}

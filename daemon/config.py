@@ -135,7 +135,7 @@ class DetectionConfig(_Section):
         2.0, ge=0, description="seconds between the first and the last of them: a slow car covers a place for less"
     )
     cluster_distance_m: float = Field(0.4, gt=0, description="points nearer than this belong to one object")
-    min_points: int = Field(20, ge=1, description="confirmed points (5 cm voxels) that an object must have")
+    min_points: int = Field(25, ge=1, description="confirmed points (5 cm voxels) that an object must have")
     ground_filter_c1_m: float = Field(0.15, gt=0, description="B1: distance of an object's mean to the ground plane")
     ground_filter_c2: float = Field(0.9, gt=0, description="B2: Bhattacharyya covariance term")
 

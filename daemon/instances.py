@@ -84,16 +84,19 @@ class ChangeDetection:
     def job(self, instance: Instance) -> Job:
         """What is to be compared. Raises Rejected where a submap would say too little."""
         index, range_m = self._store.index, self._config.submaps.range_m
-        cumulative = self._choose(index.scans_of_scene(instance.scene_id, before_visit=instance.visit))
+        before_visit = index.scans_of_scene(instance.scene_id, before_visit=instance.visit)
+        cumulative = self._choose(before_visit)
         recent = self._choose(index.scans_of_scene(instance.scene_id, visit=instance.visit))
         positions = cumulative.T_map_sensor[:, :3, 3]
         box = positions.min(axis=0) - range_m, positions.max(axis=0) + range_m
-        before = instance.session_id, instance.t_in_ns
+        # Not what a neighbouring scene found gone a moment ago: its far view would erase half of a thing, and leave
+        # the better view from here the other half to find.
+        visited_until = int(before_visit.session[-1]), int(before_visit.stamp_ns[-1]) + 1
         return Job(
             Selection(cumulative.session, cumulative.scan_id, cumulative.visit_number),
             Selection(recent.session, recent.scan_id, recent.visit_number),
-            self._manager.erasures(instance.map_id, box, before),
-            self._manager.known(instance.map_id, box, before),
+            self._manager.erasures(instance.map_id, box, visited_until),
+            self._manager.known(instance.map_id, box, (instance.session_id, instance.t_in_ns)),
             range_m,
             self._thresholds,
         )

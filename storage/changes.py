@@ -123,6 +123,13 @@ class ChangeStore:
             }
             self._update(change_id, values)
 
+    def merge(self, part_id: int, whole_id: int) -> None:
+        """A change turns out to be part of another: its points go there, and it ends, superseded by it."""
+        with self._db.transaction():
+            part, whole = self.get(part_id), self.get(whole_id)
+            self.extend(whole_id, part.points, max(part.confidence, whole.confidence), whole.evidence)
+            self._update(part_id, {"state": "ended", "superseded_by": whole_id})
+
     def observe(
         self,
         change_id: int,

@@ -107,7 +107,8 @@ CREATE TABLE changes (                 -- one object that appeared or disappeare
     revision             INTEGER NOT NULL UNIQUE,  -- grows with each new or altered row: read on from the last seen
     polarity             TEXT NOT NULL CHECK (polarity IN ('appeared', 'disappeared')),
     state                TEXT NOT NULL DEFAULT 'present' CHECK (state IN ('present', 'ended')),
-                                       -- ended: undone since; what appeared has gone, what disappeared is back
+                                       -- ended: undone since (what appeared has gone, what disappeared is back),
+                                       -- or part of superseded_by, where that is of the same polarity
     superseded_by        INTEGER REFERENCES changes (id),  -- the change that ended this one, if there is one
     map_id               INTEGER NOT NULL,  -- this and the next three: ids of index.db
     session_id           INTEGER NOT NULL,

@@ -6,11 +6,21 @@ Tests compare them on small arrays, tests/benchmarks/instances.py on whole subma
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import minimum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from revisitd.daemon.detection import ground as g
-from revisitd.daemon.detection.submap import MAX_COLUMNS, MIN_NEIGHBOURS, DepthImage, slope_edges
+from revisitd.daemon.detection.submap import (
+    AT,
+    GLIMPSED,
+    HIDDEN,
+    MAX_COLUMNS,
+    MIN_NEIGHBOURS,
+    OPEN,
+    THROUGH,
+    UNKNOWN,
+    DepthImage,
+    slope_edges,
+)
 from revisitd.daemon.geometry import column_phase, deskew, fraction_of, inverse, transform
 from revisitd.daemon.submap_build import MID_SWEEP
 from revisitd.daemon.views import OWN_BODY_M
@@ -53,19 +63,24 @@ def depth_image(points, T_map_vantage, altitude_rad, columns):
     inside = row >= 0
     depth = np.full((len(altitude_rad), columns), np.inf, dtype=np.float32)
     np.minimum.at(depth, (row[inside], col[inside]), distance[inside])
-    known = uniform_filter(np.isfinite(depth).astype(np.float32), 3, mode=("nearest", "wrap")) * 9.0
-    nearest = minimum_filter(depth, 3, mode=("nearest", "wrap"))
-    nearest[known < MIN_NEIGHBOURS - 0.5] = np.nan
-    return DepthImage(inverse(T_map_vantage), edges, nearest)
+    return DepthImage(inverse(T_map_vantage), edges, depth)
 
 
-def look_at(image, points):
-    local = transform(image.T_sensor_map, points)
-    row, col, distance = _pixels(local, image.slope_edges, image.nearest.shape[1])
-    inside = row >= 0
-    seen = np.full(len(points), np.nan, dtype=np.float32)
-    seen[inside] = image.nearest[row[inside], col[inside]]
-    return distance, seen
+def look_at(image, points, margin_m, range_m):
+    height, width = image.depth.shape
+    row, col, distance = _pixels(transform(image.T_sensor_map, points), image.slope_edges, width)
+    steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    around = np.stack([image.depth[np.clip(row + i, 0, height - 1), (col + j) % width] for i, j in steps])
+    known, nearest = np.isfinite(around).sum(axis=0), around.min(axis=0, initial=np.inf)
+    cases = [
+        (row < 0) | (distance >= range_m),
+        (np.abs(nearest - distance) <= margin_m) & (known >= MIN_NEIGHBOURS),
+        (np.abs(around - distance) <= margin_m).any(axis=0),
+        known == 0,
+        nearest < distance,
+        known >= MIN_NEIGHBOURS,
+    ]
+    return np.select(cases, [UNKNOWN, AT, GLIMPSED, OPEN, HIDDEN, THROUGH], UNKNOWN)
 
 
 def _pixels(local, edges, columns):

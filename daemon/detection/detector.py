@@ -17,7 +17,7 @@ from .results import DetectedObject, Detection, Thresholds
 from .submap import Submap
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
-COMPLETE_M = 1.0  # ... and by looked-through points of any distance, so far around them,
+COMPLETE_M = 1.5  # ... and by looked-through points of any distance, so far around them,
 COMPLETE_STEP_M = 0.2  # without a gap wider than this
 COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
 COUNTERPART_SHARE = 0.2  # also against the size of what came
@@ -66,7 +66,7 @@ def _one_way(
     this = standing.only(is_far)
     this = this.only(dense_enough(this.points, t.rho_m, t.n))
     watch.lap("noise")
-    confirmed, possible = _evidence(this, other, t)
+    confirmed, possible, open_ = _evidence(this, other, t)
     watch.lap("occlusion")
     objects = []
     for member in _objects(this.points, confirmed, possible, t.cluster_distance_m):
@@ -78,36 +78,46 @@ def _one_way(
             continue
         if is_ground_like(this.points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
             continue
-        found = _described(polarity, this, member, sure, _completion(this.points[sure], standing, other, t), other, t)
+        more = _completion(this.points[sure], this.points[open_], standing, other, t)
+        found = _described(polarity, this, member, sure, more, other, t)
         if found is not None:
             objects.append(found)
     watch.lap("clusters")
     return Detection(objects, len(this.points), int(confirmed.sum()), watch.seconds)
 
 
-def _evidence(this: Submap, other: Submap, t: Thresholds) -> tuple[np.ndarray, np.ndarray]:
-    """Which points (N,) stayed through their own visit and were looked through by the other; which may have been."""
+def _evidence(
+    this: Submap, other: Submap, t: Thresholds, glimpses: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points that stayed through their own visit, three times (N,) bool: which were looked through by the other
+    one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it."""
     sight_limits = (t.occlusion_margin_m, t.occlusion_range_m)
     seen = latest_sight(this.points, other, *sight_limits, t.min_confirming_scans)
     confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
     possible = confirmed | (seen.at <= seen.through)
     possible[possible] = persistent(
-        this.points[possible], this.scan[possible], this, *sight_limits, t.min_showing_scans, t.min_showing_s
+        this.points[possible], this.scan[possible], this, *sight_limits, t.min_showing_scans, t.min_showing_s, glimpses
     )
-    return confirmed & possible, possible
+    in_vain = (seen.at == 0) & (seen.through + seen.open >= t.min_confirming_scans)
+    return confirmed & possible, possible, in_vain & possible
 
 
-def _completion(sure: np.ndarray, standing: Submap, other: Submap, t: Thresholds) -> np.ndarray:
-    """Points (M, 3) around an object's confirmed ones that were looked through too, however near to what stands there.
+def _completion(sure: np.ndarray, in_vain: np.ndarray, standing: Submap, other: Submap, t: Thresholds) -> np.ndarray:
+    """Points (M, 3) around an object's confirmed ones that its own distance, or the sky behind it, did not confirm.
 
     A door that closes a car, a bag against a wall: most of it lies within tau of what stays. Its own distance says
-    nothing, but the beams that went through its place do; beside an object that is sure they are believed.
+    nothing, but the beams that went through its place do; beside an object that is sure they are believed. So are
+    candidates before the sky, a sign on its pole: no beam came back from there.
     """
-    near = _looked_through_around(sure, standing, other, t)
-    if not len(near.points):
-        return near.points
-    label = cluster(np.concatenate([sure, near.points]), COMPLETE_STEP_M)
-    return near.points[np.isin(label[len(sure) :], label[: len(sure)])]
+    near = _looked_through_around(sure, standing, other, t).points
+    lower, upper = bounds(sure)
+    reach = np.float32(COMPLETE_M)
+    more = np.concatenate([near, in_vain[inside(in_vain, lower - reach, upper + reach)]])
+    if not len(more):
+        return more
+    more = more[thin(more)]
+    label = cluster(np.concatenate([sure, more]), COMPLETE_STEP_M)
+    return more[np.isin(label[len(sure) :], label[: len(sure)])]
 
 
 def _counterparts(
@@ -148,7 +158,7 @@ def _looked_through_around(points: np.ndarray, standing: Submap, other: Submap, 
     reach = np.float32(COMPLETE_M)
     near = standing.only(inside(standing.points, lower - reach, upper + reach))
     near = near.only(_first_of_voxels(near.points))
-    return near.only(_evidence(near, other, t)[0])
+    return near.only(_evidence(near, other, t, glimpses=True)[0])
 
 
 def _described(
@@ -161,12 +171,10 @@ def _described(
     own_scans = np.unique(this.scan[member])
     own_ns, other_ns = this.stamp_ns[own_scans], other.stamp_ns[through]
     before, after = (other_ns, own_ns) if polarity == "appeared" else (own_ns, other_ns)
-    # The confirmed ones first: of each voxel the first point stays.
-    points = np.concatenate([this.points[sure], more, this.points[member]])
-    kept = thin(points)
-    n_confirmed = int((kept < len(sure) + len(more)).sum())
+    points = np.concatenate([this.points[sure], this.points[member], more])
+    points = points[thin(points)]
     return DetectedObject(
-        polarity, points[kept], int(before.max()), int(after.min()), n_confirmed, len(own_scans), len(through)
+        polarity, points, int(before.max()), int(after.min()), len(sure), len(own_scans), len(through)
     )
 
 

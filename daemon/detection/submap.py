@@ -13,27 +13,35 @@ MAX_COLUMNS = 1024  # finer images have holes between the returns of a 1024-colu
 MIN_NEIGHBOURS = 5  # returns among 3 x 3 pixels without which nothing is known of a direction
 
 
+# What a scan saw in the direction of a point: nothing known, past it, it, perhaps it, something before it, no return.
+UNKNOWN, THROUGH, AT, GLIMPSED, HIDDEN, OPEN = range(6)
+
+
 @dataclass(frozen=True, eq=False)
 class DepthImage:
     """What one scan saw in each direction from one place.
 
     T_sensor_map (4, 4) maps map coordinates to the vantage point's frame (z up); slope_edges (H + 1,) float32
-    ascending: tangents of the elevations between neighbouring beams, and of the field of view's two ends; nearest
-    (H, W) float32 metres: the smallest range among each pixel's 3 x 3 neighbours, NaN where fewer than
-    MIN_NEIGHBOURS of them hold a return. No return is not free space.
+    ascending: tangents of the elevations between neighbouring beams, and of the field of view's two ends; depth
+    (H, W) float32 metres: the smallest range in each pixel, inf without a return.
     """
 
     T_sensor_map: np.ndarray
     slope_edges: np.ndarray
-    nearest: np.ndarray
+    depth: np.ndarray
 
-    def look_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Range of points (N, 3) map frame from the vantage point, and the range seen in that direction.
+    def look_at(self, points: np.ndarray, margin_m: float, range_m: float) -> np.ndarray:
+        """What the scan saw at the place of each point (N, 3) map frame: (N,) int8, UNKNOWN to OPEN.
 
-        Both (N,) float32 metres; the second is NaN where nothing is known, out of the field of view too.
+        A point's pixel and its eight neighbours are asked, for edges and pose errors. Of at least MIN_NEIGHBOURS
+        returns the nearest lies margin behind the point: THROUGH, or within the margin of it: AT. Another one lies
+        there, or too few are known: GLIMPSED. All lie before it: HIDDEN. There is none, which is not free space: OPEN.
+        UNKNOWN too beyond range_m.
         """
         R, t = self.T_sensor_map[:3, :3], self.T_sensor_map[:3, 3]
-        return _look_at(points, R.astype(np.float32), t.astype(np.float32), self.slope_edges, self.nearest)
+        return _look_at(
+            points, R.astype(np.float32), t.astype(np.float32), self.slope_edges, self.depth, margin_m, range_m
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +82,11 @@ def depth_image(points: np.ndarray, T_map_vantage: np.ndarray, altitude_rad: np.
     altitude_rad (H,) the sensor's beams; columns per turn.
     """
     edges = slope_edges(altitude_rad)
-    nearest = _nearest_around(_depth(points, edges, min(columns, MAX_COLUMNS)))
     R = T_map_vantage[:3, :3]
     T_sensor_map = np.eye(4)
     T_sensor_map[:3, :3] = R.T
     T_sensor_map[:3, 3] = -R.T @ T_map_vantage[:3, 3]
-    return DepthImage(T_sensor_map, edges, nearest)
+    return DepthImage(T_sensor_map, edges, _depth(points, edges, min(columns, MAX_COLUMNS)))
 
 
 @kernel
@@ -113,34 +120,32 @@ def _depth(points, edges, columns):
 
 
 @kernel
-def _nearest_around(depth):
-    """The smallest of 3 x 3 pixels, NaN where too few are finite; columns go round, the outer rows count twice."""
+def _look_at(points, R, t, edges, depth, margin, max_range):
     height, width = depth.shape
-    nearest = np.empty_like(depth)
-    for row in range(height):
-        for column in range(width):
-            known, least = 0, np.float32(np.inf)
-            for i in range(-1, 2):
-                r = min(max(row + i, 0), height - 1)
-                for j in range(-1, 2):
-                    value = depth[r, (column + j) % width]
-                    if value < np.inf:
-                        known += 1
-                        least = min(least, value)
-            nearest[row, column] = least if known >= MIN_NEIGHBOURS else np.nan
-    return nearest
-
-
-@kernel
-def _look_at(points, R, t, edges, nearest):
-    distance = np.empty(len(points), np.float32)
-    seen = np.full(len(points), np.nan, np.float32)
+    out = np.full(len(points), UNKNOWN, np.int8)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
         y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
         z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
-        row, column, distance[i] = _pixel(x, y, z, edges, nearest.shape[1])
-        if row >= 0:
-            seen[i] = nearest[row, column]
-    return distance, seen
+        row, column, distance = _pixel(x, y, z, edges, width)
+        if row < 0 or distance >= max_range:
+            continue
+        known, nearest, met = 0, np.float32(np.inf), False
+        for dr in range(-1, 2):
+            r = min(max(row + dr, 0), height - 1)
+            for dc in range(-1, 2):
+                seen = depth[r, (column + dc) % width]
+                if seen < np.inf:
+                    known += 1
+                    nearest = min(nearest, seen)
+                    met = met or abs(seen - distance) <= margin
+        if met:
+            out[i] = AT if known >= MIN_NEIGHBOURS and abs(nearest - distance) <= margin else GLIMPSED
+        elif known == 0:
+            out[i] = OPEN
+        elif nearest < distance:
+            out[i] = HIDDEN
+        elif known >= MIN_NEIGHBOURS:
+            out[i] = THROUGH
+    return out
