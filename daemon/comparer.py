@@ -18,10 +18,12 @@ from .comparison import Comparison, Job, ScanFacts, Selection
 from .detection.detector import detect
 from .detection.erasure import update_map
 from .detection.occlusion import state_of
-from .detection.submap import Submap
+from .detection.submap import Submap, join
 from .sensors import Sensors
 from .stopwatch import Stopwatch
 from .submap_build import build_submap
+
+MORE_SCANS = 12  # of a side, the nearest to an object beyond those of the submap, are asked for the rest of it
 
 
 class Comparer:
@@ -38,9 +40,11 @@ class Comparer:
         cumulative, facts_c = self.load(job.cumulative, job.range_m)
         recent, facts_r = self.load(job.recent, job.range_m)
         watch.lap("load")
-        cumulative = update_map(cumulative, job.cumulative.session, job.erasures)
+        cumulative = update_map(cumulative, job.cumulative.session[job.cumulative.chosen], job.erasures)
         watch.lap("update_map")
-        detection = detect(cumulative, recent, job.thresholds)
+        more_cumulative = _More(self, job.cumulative, cumulative, facts_c, job)
+        more_recent = _More(self, job.recent, recent, facts_r, job)
+        detection = detect(cumulative, recent, job.thresholds, more_cumulative.around, more_recent.around)
         watch.restart()
         limits = job.thresholds.occlusion_margin_m, job.thresholds.occlusion_range_m
         known = [state_of(change, recent.images, *limits) for change in job.known]
@@ -49,14 +53,41 @@ class Comparer:
         return Comparison(detection, known, facts_c, facts_r, *sizes, {**watch.seconds, **detection.seconds})
 
     def load(self, selection: Selection, range_m: float) -> tuple[Submap, ScanFacts]:
-        """The submap of some stored scans."""
-
-        def read(i: int) -> tuple[Scan, Sensor]:
-            scan = self._scans.read(int(selection.session[i]), int(selection.scan_id[i]))
-            return scan, self._sensors.get(scan.sensor_digest)
-
-        submap, scans = build_submap(read, selection.visit, range_m)
+        """The submap of a selection's chosen scans."""
+        chosen = selection.only(selection.chosen)
+        submap, scans = build_submap(lambda i: self.read(chosen, i), chosen.visit, range_m)
         return submap, _facts(scans)
+
+    def read(self, selection: Selection, i: int) -> tuple[Scan, Sensor]:
+        """One scan of a selection and its sensor."""
+        scan = self._scans.read(int(selection.session[i]), int(selection.scan_id[i]))
+        return scan, self._sensors.get(scan.sensor_digest)
+
+
+class _More:
+    """A side's scans beyond those of its submap: the nearest ones are loaded when an object wants to be completed."""
+
+    def __init__(self, comparer: Comparer, selection: Selection, submap: Submap, facts: ScanFacts, job: Job):
+        self._comparer, self._submap, self._facts, self._job = comparer, submap, facts, job
+        self._rest = selection.only(~selection.chosen)
+        self._loaded: dict[tuple[int, ...], Submap] = {}
+
+    def around(self, lower: np.ndarray, upper: np.ndarray) -> Submap:
+        """The points in a box, ground too, of the submap's scans and of those nearest to it."""
+        distance = np.linalg.norm(self._rest.position_m - 0.5 * (lower + upper), axis=1)
+        nearest = tuple(np.sort(np.argsort(distance, kind="stable")[:MORE_SCANS]).tolist())
+        if nearest not in self._loaded:
+            self._loaded = {nearest: self._load(self._rest.only(np.array(nearest, np.int64)))}  # one: it takes 20 MB
+        return join(self._submap.around(lower, upper), self._loaded[nearest].around(lower, upper))
+
+    def _load(self, selection: Selection) -> Submap:
+        submap, scans = build_submap(
+            lambda i: self._comparer.read(selection, i), selection.visit, self._job.range_m
+        )
+        facts = _facts(scans)
+        self._facts.session.update(facts.session)
+        self._facts.host_ns.update(facts.host_ns)
+        return update_map(submap, selection.session, self._job.erasures)
 
 
 def _facts(scans: list[Scan]) -> ScanFacts:

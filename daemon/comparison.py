@@ -11,11 +11,22 @@ from .detection.results import Detection, Erasure, KnownChange, KnownState, Thre
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Scans of one submap: session (S,), scan_id (S,) and visit (S,), int64."""
+    """The scans of one side that may be used, and which of them represent it.
+
+    session (S,), scan_id (S,) and visit (S,) int64; position_m (S, 3) map frame; chosen (S,) bool: the submap's.
+    """
 
     session: np.ndarray
     scan_id: np.ndarray
     visit: np.ndarray
+    position_m: np.ndarray
+    chosen: np.ndarray
+
+    def only(self, keep: np.ndarray) -> Selection:
+        """Some of the scans, by indices or (S,) bool."""
+        return Selection(
+            self.session[keep], self.scan_id[keep], self.visit[keep], self.position_m[keep], self.chosen[keep]
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import time
 
+import numpy as np
+
 from ..storage.index import InstanceRow, SceneScans
 from ..storage.store import Store
 from .changes import ChangeManager, Finding
@@ -57,8 +59,8 @@ class ChangeDetection:
                 status="done",
                 seconds=time.perf_counter() - start,
                 stage_seconds=comparison.seconds,
-                n_cumulative_scans=len(job.cumulative.scan_id),
-                n_recent_scans=len(job.recent.scan_id),
+                n_cumulative_scans=int(job.cumulative.chosen.sum()),
+                n_recent_scans=int(job.recent.chosen.sum()),
                 n_candidates=comparison.detection.n_candidates,
                 n_confirmed=comparison.detection.n_confirmed,
                 n_changes=n_new,
@@ -70,8 +72,8 @@ class ChangeDetection:
         """End the process that compares."""
         self._process.close()
 
-    def _choose(self, scans: SceneScans) -> SceneScans:
-        """The scans that represent these visits best (OptMap), of those whose poses can be trusted in this scene."""
+    def _choose(self, scans: SceneScans) -> Selection:
+        """Of the scans whose poses can be trusted in this scene, those that represent the visits best (OptMap)."""
         usable = scans.only(((scans.visit_number == 1) | scans.aligned) & (scans.model_id == self._model_id))
         if len(usable.scan_id) < MIN_SCANS:
             raise Rejected(
@@ -79,7 +81,11 @@ class ChangeDetection:
                 f"at least {MIN_SCANS} are needed"
             )
         k = max(MIN_SCANS, round(self._config.submaps.k * self._config.scenes.alpha_m2 / REFERENCE_ALPHA_M2))
-        return usable.only(select(usable.descriptors, usable.visit_number, k))
+        chosen = np.zeros(len(usable.scan_id), dtype=bool)
+        chosen[select(usable.descriptors, usable.visit_number, k)] = True
+        return Selection(
+            usable.session, usable.scan_id, usable.visit_number, usable.T_map_sensor[:, :3, 3], chosen
+        )
 
     def job(self, instance: Instance) -> Job:
         """What is to be compared. Raises Rejected where a submap would say too little."""
@@ -87,14 +93,13 @@ class ChangeDetection:
         before_visit = index.scans_of_scene(instance.scene_id, before_visit=instance.visit)
         cumulative = self._choose(before_visit)
         recent = self._choose(index.scans_of_scene(instance.scene_id, visit=instance.visit))
-        positions = cumulative.T_map_sensor[:, :3, 3]
-        box = positions.min(axis=0) - range_m, positions.max(axis=0) + range_m
+        box = cumulative.position_m.min(axis=0) - range_m, cumulative.position_m.max(axis=0) + range_m
         # Not what a neighbouring scene found gone a moment ago: its far view would erase half of a thing, and leave
         # the better view from here the other half to find.
         visited_until = int(before_visit.session[-1]), int(before_visit.stamp_ns[-1]) + 1
         return Job(
-            Selection(cumulative.session, cumulative.scan_id, cumulative.visit_number),
-            Selection(recent.session, recent.scan_id, recent.visit_number),
+            cumulative,
+            recent,
             self._manager.erasures(instance.map_id, box, visited_until),
             self._manager.known(instance.map_id, box, (instance.session_id, instance.t_in_ns)),
             range_m,

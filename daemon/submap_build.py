@@ -26,7 +26,7 @@ def build_submap(
     with ThreadPoolExecutor(THREADS, thread_name_prefix="submap") as pool:
         views = list(pool.map(lambda i: scan_view(*read(i), range_m), range(len(visits))))
     scans = [view[0] for view in views]
-    points = np.concatenate([view[1] for view in views])
+    points = np.concatenate([np.empty((0, 3), np.float32), *(view[1] for view in views)])
     scan_index = np.repeat(np.arange(len(views), dtype=np.int16), [len(view[1]) for view in views])
     stamps = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
     return Submap(points, scan_index, [view[2] for view in views], visits, stamps), scans

@@ -127,7 +127,7 @@ def test_no_ground_is_invented_without_points_for_it():
     points = np.array([[0, 0, 0], [1, 1, 3], [2, 2, 1]], np.float32)
     is_ground, ground = segment_ground(points, np.zeros(2), 3.0, 0.035)
     assert not is_ground.any()
-    assert np.isnan(ground.height(points)).all()
+    assert not ground.is_under(points, 3.0, 0.035).any()
 
 
 def test_a_patch_of_ground_is_ground_like_and_a_bag_is_not():
@@ -202,7 +202,7 @@ def test_what_the_own_visit_looks_through_has_not_stayed():
     walked_on = submap([standing, empty, empty, empty], [1, 1, 1, 1])
     stayed = submap([standing] * 4, [1, 1, 1, 1])
     appeared_later = submap([standing] * 3 + [empty, empty], [2, 2, 2, 1, 1])
-    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3, 2.0)[0]
-    assert persistent(person, scan, stayed, 0.3, 18.0, 3, 2.0)[0]
-    assert not persistent(person, scan, replace(stayed, stamp_ns=stamps // 10), 0.3, 18.0, 3, 2.0)[0]  # only a moment
-    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3, 2.0)[0]
+    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3, 2.0, False)[0]
+    assert persistent(person, scan, stayed, 0.3, 18.0, 3, 2.0, False)[0]
+    assert not persistent(person, scan, replace(stayed, stamp_ns=stamps // 10), 0.3, 18.0, 3, 2.0, False)[0]
+    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3, 2.0, False)[0]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,8 +26,25 @@ COUNTERPART_SHARE = 0.2  # also against the size of what came
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
 
-def detect(cumulative: Submap, recent: Submap, thresholds: Thresholds) -> Detection:
-    """Changes of the recent submap against the cumulative one: what appeared and what disappeared."""
+Around = Callable[[np.ndarray, np.ndarray], Submap]  # lower and upper corner (3,) of a box, map frame -> what is in it
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """One side of the comparison: its submap without ground, the ground, and all its scans' points in a box."""
+
+    standing: Submap
+    ground: Ground
+    around: Around
+
+
+def detect(
+    cumulative: Submap, recent: Submap, thresholds: Thresholds, more_cumulative: Around, more_recent: Around
+) -> Detection:
+    """Changes of the recent submap against the cumulative one: what appeared and what disappeared.
+
+    more_...: the points in a box of all scans of the side, by which an object that was found is completed.
+    """
     t, watch = thresholds, Stopwatch()
     with ThreadPoolExecutor(2, thread_name_prefix="detect") as pool:  # the compiled loops run without the lock
         (standing_c, ground_c), (standing_r, ground_r) = pool.map(without_ground, (cumulative, recent), (t, t))
@@ -33,10 +52,11 @@ def detect(cumulative: Submap, recent: Submap, thresholds: Thresholds) -> Detect
         new, old = standing_r.points, standing_c.points
         is_new, is_old = pool.map(changed, (new, old), (old, new), (t.tau_m,) * 2, (t.n,) * 2)
         watch.lap("neighbours")
-    appeared = _one_way("appeared", standing_r, is_new, standing_c, ground_c, t, watch)
-    disappeared = _one_way("disappeared", standing_c, is_old, standing_r, ground_r, t, watch)
-    left = _counterparts(appeared.objects, disappeared.objects, "disappeared", standing_c, standing_r, ground_r, t)
-    taken = _counterparts(disappeared.objects, appeared.objects, "appeared", standing_r, standing_c, ground_c, t)
+    before, now = _Side(standing_c, ground_c, more_cumulative), _Side(standing_r, ground_r, more_recent)
+    appeared = _one_way("appeared", now, is_new, before, t, watch)
+    disappeared = _one_way("disappeared", before, is_old, now, t, watch)
+    left = _counterparts(appeared.objects, disappeared.objects, "disappeared", before, now, t)
+    taken = _counterparts(disappeared.objects, appeared.objects, "appeared", now, before, t)
     watch.lap("clusters")
     return Detection(
         appeared.objects + disappeared.objects + left + taken,
@@ -54,19 +74,13 @@ def without_ground(submap: Submap, t: Thresholds) -> tuple[Submap, Ground]:
 
 
 def _one_way(
-    polarity: str,
-    standing: Submap,
-    is_far: np.ndarray,
-    other: Submap,
-    other_ground: Ground,
-    t: Thresholds,
-    watch: Stopwatch,
+    polarity: str, side: _Side, is_far: np.ndarray, other: _Side, t: Thresholds, watch: Stopwatch
 ) -> Detection:
-    """Objects among the points of one submap that are far from the other's, which could have seen them and did not."""
-    this = standing.only(is_far)
+    """Objects among the points of one side that are far from the other's, which could have seen them and did not."""
+    this = side.standing.only(is_far)
     this = this.only(dense_enough(this.points, t.rho_m, t.n))
     watch.lap("noise")
-    confirmed, possible, open_ = _evidence(this, other, t)
+    confirmed, possible, open_ = _evidence(this, other.standing, t, glimpses=False)
     watch.lap("occlusion")
     objects = []
     for member in _objects(this.points, confirmed, possible, t.cluster_distance_m):
@@ -76,10 +90,10 @@ def _one_way(
             continue
         if len(np.unique(this.scan[member])) < t.min_showing_scans:
             continue
-        if is_ground_like(this.points[kept], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
+        if is_ground_like(this.points[kept], other.ground, t.ground_filter_c1_m, t.ground_filter_c2):
             continue
-        more = _completion(this.points[sure], this.points[open_], standing, other, t)
-        found = _described(polarity, this, member, sure, more, other, t)
+        more = _completion(this.points[sure], this.points[open_], side, other, t)
+        found = _described(polarity, this, member, sure, more, other.standing, t)
         if found is not None:
             objects.append(found)
     watch.lap("clusters")
@@ -87,7 +101,7 @@ def _one_way(
 
 
 def _evidence(
-    this: Submap, other: Submap, t: Thresholds, glimpses: bool = False
+    this: Submap, other: Submap, t: Thresholds, glimpses: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of points that stayed through their own visit, three times (N,) bool: which were looked through by the other
     one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it."""
@@ -102,14 +116,14 @@ def _evidence(
     return confirmed & possible, possible, in_vain & possible
 
 
-def _completion(sure: np.ndarray, in_vain: np.ndarray, standing: Submap, other: Submap, t: Thresholds) -> np.ndarray:
+def _completion(sure: np.ndarray, in_vain: np.ndarray, side: _Side, other: _Side, t: Thresholds) -> np.ndarray:
     """Points (M, 3) around an object's confirmed ones that its own distance, or the sky behind it, did not confirm.
 
     A door that closes a car, a bag against a wall: most of it lies within tau of what stays. Its own distance says
     nothing, but the beams that went through its place do; beside an object that is sure they are believed. So are
     candidates before the sky, a sign on its pole: no beam came back from there.
     """
-    near = _looked_through_around(sure, standing, other, t).points
+    near = _looked_through_around(sure, side, other, t, glimpses=True).points
     lower, upper = bounds(sure)
     reach = np.float32(COMPLETE_M)
     more = np.concatenate([near, in_vain[inside(in_vain, lower - reach, upper + reach)]])
@@ -124,9 +138,8 @@ def _counterparts(
     found: list[DetectedObject],
     known: list[DetectedObject],
     polarity: str,
-    standing: Submap,
-    other: Submap,
-    other_ground: Ground,
+    side: _Side,
+    other: _Side,
     t: Thresholds,
 ) -> list[DetectedObject]:
     """What left the place beside a thing that came, or came where one left, and is within tau of what stays there.
@@ -136,7 +149,7 @@ def _counterparts(
     """
     counterparts = []
     for change in found:
-        near = _looked_through_around(change.points, standing, other, t)
+        near = _looked_through_around(change.points, side, other, t, glimpses=False)
         for old in known + counterparts:
             near = near.only(changed(near.points, old.points, t.tau_m, 1))
         if not len(near.points):
@@ -145,20 +158,23 @@ def _counterparts(
         least = max(COUNTERPART_POINTS, COUNTERPART_SHARE * len(change.points))
         for i in np.flatnonzero(np.bincount(label) >= least):
             member = np.flatnonzero(label == i)
-            if is_ground_like(near.points[member], other_ground, t.ground_filter_c1_m, t.ground_filter_c2):
+            if is_ground_like(near.points[member], other.ground, t.ground_filter_c1_m, t.ground_filter_c2):
                 continue
-            described = _described(polarity, near, member, member, near.points[:0], other, t)
+            described = _described(polarity, near, member, member, near.points[:0], other.standing, t)
             counterparts += [described] if described else []
     return counterparts
 
 
-def _looked_through_around(points: np.ndarray, standing: Submap, other: Submap, t: Thresholds) -> Submap:
-    """The part of a submap around some points that the other one looked through, one point for each voxel."""
+def _looked_through_around(
+    points: np.ndarray, side: _Side, other: _Side, t: Thresholds, glimpses: bool
+) -> Submap:
+    """What stands around some points, by all scans of a side, and was looked through by the other; one per voxel."""
     lower, upper = bounds(points)
-    reach = np.float32(COMPLETE_M)
-    near = standing.only(inside(standing.points, lower - reach, upper + reach))
+    near = side.around(lower - np.float32(COMPLETE_M), upper + np.float32(COMPLETE_M))
     near = near.only(_first_of_voxels(near.points))
-    return near.only(_evidence(near, other, t, glimpses=True)[0])
+    for ground in (side.ground, other.ground):
+        near = near.only(~ground.is_under(near.points, t.ground_sigmas, t.ground_min_sigma_m))
+    return near.only(_evidence(near, other.standing, t, glimpses)[0])
 
 
 def _described(

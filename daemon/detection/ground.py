@@ -42,12 +42,13 @@ class Ground:
         distance, index = self._tree.query(points[:, :2])
         return index, distance <= MAX_BORROW_M
 
-    def height(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) metres of points above the nearest plane; NaN where no ground is known."""
+    def is_under(self, points: np.ndarray, sigmas: float, min_sigma_m: float) -> np.ndarray:
+        """Which of a few points (N, 3) are ground by the nearest plane: (N,) bool; not where no ground is known."""
         index, known = self.nearest(points)
-        out = np.full(len(points), np.nan, dtype=np.float32)
+        out = np.zeros(len(points), dtype=bool)
         at = index[known]
-        out[known] = ((points[known] - self.mean[at]) * self.normal[at]).sum(axis=1)
+        height = ((points[known] - self.mean[at]) * self.normal[at]).sum(axis=1)
+        out[known] = height < sigmas * np.maximum(self.sigma[at], min_sigma_m)
         return out
 
 

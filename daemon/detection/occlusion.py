@@ -58,7 +58,7 @@ def persistent(
     range_m: float,
     min_scans: int,
     min_s: float,
-    glimpses: bool = False,
+    glimpses: bool,
 ) -> np.ndarray:
     """Which points (N, 3), each of scan (N,) of its own submap, stayed where they were through their own visit.
 

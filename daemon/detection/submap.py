@@ -62,6 +62,21 @@ class Submap:
         points, scan = arrays.keep(self.points, self.scan, keep)
         return replace(self, points=points, scan=scan)
 
+    def around(self, lower: np.ndarray, upper: np.ndarray) -> Submap:
+        """The same scans with the points in a box, lower and upper corner (3,)."""
+        return self.only(arrays.inside(self.points, lower, upper))
+
+
+def join(a: Submap, b: Submap) -> Submap:
+    """The scans of both."""
+    return Submap(
+        np.concatenate([a.points, b.points]),
+        np.concatenate([a.scan, b.scan + np.int16(len(a.images))]),
+        a.images + b.images,
+        np.concatenate([a.visit, b.visit]),
+        np.concatenate([a.stamp_ns, b.stamp_ns]),
+    )
+
 
 def slope_edges(altitude_rad: np.ndarray) -> np.ndarray:
     """Where one beam's pixels end and the next one's begin, as tangents of elevation: (H + 1,) float32 ascending.
