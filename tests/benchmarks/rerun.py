@@ -1,0 +1,91 @@
+"""Runs the change detection of a stored patrol again, in this process, with other settings or other parts."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+from revisitd.daemon.comparer import Comparer
+from revisitd.daemon.comparison import Comparison, Job
+from revisitd.daemon.config import Config
+from revisitd.daemon.instances import ChangeDetection
+from revisitd.daemon.scenes import SceneTracker
+from revisitd.daemon.session import Session
+from revisitd.daemon.worker import Instance
+from revisitd.storage.store import Store
+
+VISITS = """
+    SELECT v.session_id, s.map_id, v.scene_id, v.visit_id, v.number, v.t_in_ns, v.t_out_ns
+    FROM visits v JOIN scenes s USING (scene_id) WHERE v.number >= 2 ORDER BY v.visit_id"""
+
+
+class InProcess:
+    """A DetectionProcess without a process."""
+
+    def __init__(self, data: Path):
+        self._comparer = Comparer(data)
+
+    def compare(self, job: Job) -> Comparison:
+        """Runs the job."""
+        return self._comparer.compare(job)
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+def copy_without_changes(source: Path, into: Path) -> None:
+    """A data directory of the same scans, scenes and visits, that was never searched for changes."""
+    shutil.rmtree(into, ignore_errors=True)
+    into.mkdir(parents=True)
+    for name in ("revisitd.json", "index.db"):
+        shutil.copy(source / name, into / name)
+    for name in ("scans", "sensors"):
+        (into / name).symlink_to((source / name).resolve())
+    with sqlite3.connect(into / "index.db") as db:
+        db.execute("DELETE FROM instances")
+
+
+def find_scenes_again(data: Path, config: Config) -> None:
+    """Forget the scenes, and find them with other settings on the same key scans."""
+    with sqlite3.connect(data / "index.db") as db:
+        for table in ("visit_scans", "visits", "scenes"):
+            db.execute(f"DELETE FROM {table}")
+    with Store.open_writer(data) as store:
+        path = store.index.trajectory()
+        _, descriptors = store.index.all_descriptors(model_of(store))
+        tracker = SceneTracker(config.scenes, [], store.index.next_scene_id())
+        session = SimpleNamespace(_store=store, _config=config, session_id=1, map_id=1)
+        for i in range(len(path.scan_id)):
+            xy = path.T_map_sensor[i, :2, 3]
+            update = tracker.update(int(path.scan_id[i]), int(path.stamp_ns[i]), xy, descriptors[i])
+            Session.record(session, update)
+        Session.record(session, tracker.finish())
+
+
+def instances_of(store: Store) -> list[Instance]:
+    """Every visit but the scenes' first ones, in the order in which they ended."""
+    return [Instance(*row) for row in store.index._db.tuples(VISITS)]
+
+
+def model_of(store: Store) -> str:
+    """The id of the model that described the scans."""
+    return store.index._db.value("SELECT model_id FROM descriptors LIMIT 1")
+
+
+def detection_on(store: Store, config: Config) -> ChangeDetection:
+    """The change detection of an open store, in this process."""
+    with mock.patch("revisitd.daemon.instances.DetectionProcess", InProcess):
+        return ChangeDetection(config, store, model_of(store))
+
+
+def detect_again(data: Path, config: Config) -> list[tuple[float, int]]:
+    """Run every instance; seconds of each that was compared, and when its visit ended, ns."""
+    with Store.open_writer(data) as store:
+        detection, instances = detection_on(store, config), instances_of(store)
+        for instance in instances:
+            detection.run(instance)
+        done = dict(store.index._db.tuples("SELECT visit_id, seconds FROM instances WHERE status = 'done'"))
+    return [(done[i.visit_id], i.t_out_ns) for i in instances if i.visit_id in done]
