@@ -91,7 +91,7 @@ class AlignmentConfig(_Section):
     """Registration of key scans to the scene's first visit, and to the key scans before (GICP, small_gicp)."""
 
     voxel_m: float = Field(0.25, gt=0, description="voxel of both clouds")
-    range_m: float = Field(40.0, gt=0, description="returns farther away are not registered")
+    range_m: float = Field(60.0, gt=0, description="returns farther away are not registered")
     gate_m: float = Field(0.6, gt=0, description="pairs farther apart are not matched: changes do not pull")
     coarse_gate_m: float = Field(3.0, gt=0, description="... in a second attempt, after a large drift")
     drift_ratio: float = Field(
@@ -100,7 +100,7 @@ class AlignmentConfig(_Section):
     local_voxel_m: float = Field(
         0.5, gt=0, description="in a new place: voxel of the last key scans' map (halves KISS-ICP's error by study)"
     )
-    local_scans: int = Field(40, ge=2, description="key scans that this map remembers: 20 m of path")
+    local_scans: int = Field(120, ge=2, description="key scans that this map remembers: 60 m of path")
     min_inlier_ratio: float = Field(0.6, gt=0, le=1, description="share of the scan that must find a partner")
     max_residual_m: float = Field(
         0.12, gt=0, description="root mean square distance to the reference's surface, at most"

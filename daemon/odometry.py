@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from ..drivers.frame import Frame
 from .config import OdometryConfig
@@ -24,7 +26,7 @@ MIN_POINTS = 1000  # fewer registrable returns than this say nothing about a pos
 CHECK_EVERY = 5  # frames between two looks at the overlap (30 ms each)
 OVERLAP_SAMPLE = 1000
 MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth
-GAP_FRAMES = 1.5  # more than a jittering period: frames are missing
+LEVEL_FRAMES, SPEED_FRAMES = 5, 3  # over which the motion is smoothed
 
 
 class Health(str, Enum):
@@ -50,6 +52,34 @@ class Motion:
     health: Health
 
 
+class SteadyMotion:
+    """The sensor's motion in one frame period, smoothed over the last frames.
+
+    KISS-ICP's steps from frame to frame shake by 7 cm in height and 0.4 degrees in roll and pitch, much more than a
+    driven robot does, and a sweep that is deskewed by such a step bends. Height, roll and pitch hardly ever go on for
+    half a second: their mean is nearer to the truth. Speed changes within three frames, heading at once.
+    """
+
+    def __init__(self) -> None:
+        self._steps: deque[np.ndarray] = deque(maxlen=LEVEL_FRAMES)
+
+    def add(self, motion: np.ndarray, periods: float) -> None:
+        """One more measured motion (4, 4), made in so many frame periods."""
+        step = fraction_of(motion, 1.0 / periods)
+        self._steps.append(np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()]))
+
+    def during(self, periods: float) -> np.ndarray:
+        """The motion (4, 4) in so many frame periods; none before the first step."""
+        if not self._steps:
+            return np.eye(4)
+        steps = np.array(self._steps)
+        mean = steps.mean(axis=0)
+        step = np.eye(4)
+        step[:2, 3], step[2, 3] = steps[-SPEED_FRAMES:, :2].mean(axis=0), mean[2]
+        step[:3, :3] = Rotation.from_rotvec([mean[3], mean[4], steps[-1, 5]]).as_matrix()
+        return fraction_of(step, periods)
+
+
 class Odometry:
     """Registers frames one after another; the odometry's frame is the sensor's pose at the first frame's end."""
 
@@ -63,6 +93,7 @@ class Odometry:
         kiss.registration.max_num_iterations = 50
         kiss.registration.convergence_criterion = 1e-3
         self._kiss = KissICP(kiss)
+        self._steady = SteadyMotion()
         self._stamp_ns: int | None = None
         self._frames = 0
 
@@ -75,15 +106,14 @@ class Odometry:
         gap_frames = self._gap_frames(frame)
         if gap_frames > MAX_GAP_FRAMES:
             return Motion(previous, np.eye(4), Health.LOST_GAP)
-        if gap_frames > GAP_FRAMES:
-            # The constant-velocity guess assumes one period between frames; stretch it over the hole.
-            self._kiss.last_delta = fraction_of(self._kiss.last_delta, gap_frames)
+        # KISS-ICP's constant-velocity guess is its last step, and assumes one period between frames.
+        self._kiss.last_delta = self._steady.during(gap_frames)
         map_before = self._kiss.local_map.point_cloud() if self._frames % CHECK_EVERY == CHECK_EVERY - 1 else None
         self._kiss.register_frame(points, times)
         T_odom_sensor = self._kiss.last_pose.copy()
         motion = inverse(previous) @ T_odom_sensor if self._frames else np.eye(4)
-        if gap_frames > GAP_FRAMES:
-            self._kiss.last_delta = fraction_of(motion, 1.0 / gap_frames)
+        if self._frames:
+            self._steady.add(motion, gap_frames)
         health = self._verdict(motion, gap_frames * frame.sensor.frame_period_ns * 1e-9)
         if health is Health.GOOD and map_before is not None:
             # Against the map without this scan: on the one with it every scan lies.
@@ -91,7 +121,9 @@ class Odometry:
                 health = Health.LOST_NO_OVERLAP
         self._stamp_ns = frame.stamp_ns
         self._frames += 1
-        return Motion(T_odom_sensor, self._sweep(frame, motion, gap_frames), health)
+        times = frame.column_ns[frame.column_valid]
+        sweep_periods = min(float(times.max() - times.min()) / frame.sensor.frame_period_ns, 1.0)
+        return Motion(T_odom_sensor, self._steady.during(sweep_periods), health)
 
     def _registrable(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         """Returns (N, 3) float64 points and (N,) phases on a regular sub-grid of the image."""
@@ -112,12 +144,6 @@ class Odometry:
         if self._stamp_ns is None:
             return 1.0
         return (frame.stamp_ns - self._stamp_ns) / frame.sensor.frame_period_ns
-
-    @staticmethod
-    def _sweep(frame: Frame, motion: np.ndarray, gap_frames: float) -> np.ndarray:
-        times = frame.column_ns[frame.column_valid]
-        share = (times.max() - times.min()) / (gap_frames * frame.sensor.frame_period_ns)
-        return fraction_of(motion, min(share, 1.0))
 
     def _verdict(self, motion: np.ndarray, seconds: float) -> Health:
         if self._frames == 0:
