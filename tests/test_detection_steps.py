@@ -194,7 +194,7 @@ def test_what_the_own_visit_looks_through_has_not_stayed():
     standing = image(wall_at(5.0, half_width=0.3))
     person = np.array([[5, 0, 0]], np.float32)
     scan = np.zeros(1, np.int16)
-    stamps = np.arange(5) * 1_000_000_000
+    stamps = np.arange(10) * 1_000_000_000
 
     def submap(images, visit):
         return Submap(with_person, np.zeros(len(with_person), np.int16), images, np.array(visit), stamps)
@@ -202,7 +202,12 @@ def test_what_the_own_visit_looks_through_has_not_stayed():
     walked_on = submap([standing, empty, empty, empty], [1, 1, 1, 1])
     stayed = submap([standing] * 4, [1, 1, 1, 1])
     appeared_later = submap([standing] * 3 + [empty, empty], [2, 2, 2, 1, 1])
-    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3, 2.0, False)[0]
-    assert persistent(person, scan, stayed, 0.3, 18.0, 3, 2.0, False)[0]
-    assert not persistent(person, scan, replace(stayed, stamp_ns=stamps // 10), 0.3, 18.0, 3, 2.0, False)[0]
-    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3, 2.0, False)[0]
+    assert not persistent(person, scan, walked_on, 0.3, 18.0, 3, 2.0, False, True)[0]
+    assert persistent(person, scan, stayed, 0.3, 18.0, 3, 2.0, False, True)[0]
+    assert not persistent(person, scan, replace(stayed, stamp_ns=stamps // 10), 0.3, 18.0, 3, 2.0, False, True)[0]
+    came_in_between = submap([empty] * 4 + [standing] * 6, [1] * 10)
+    came_and_went = submap([empty] * 2 + [standing] * 6 + [empty] * 2, [1] * 10)
+    assert persistent(person, scan, came_in_between, 0.3, 18.0, 3, 2.0, False, True)[0]
+    assert not persistent(person, scan, came_in_between, 0.3, 18.0, 3, 2.0, False, False)[0]
+    assert not persistent(person, scan, came_and_went, 0.3, 18.0, 3, 2.0, False, True)[0]
+    assert persistent(person, scan, appeared_later, 0.3, 18.0, 3, 2.0, False, True)[0]

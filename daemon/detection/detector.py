@@ -109,9 +109,9 @@ def _evidence(
     seen = latest_sight(this.points, other, *sight_limits, t.min_confirming_scans)
     confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
     possible = confirmed | (seen.at <= seen.through)
-    possible[possible] = persistent(
-        this.points[possible], this.scan[possible], this, *sight_limits, t.min_showing_scans, t.min_showing_s, glimpses
-    )
+    arrivals = this.visit.min() > other.visit.max()  # what left in the middle of an older visit was only passing by
+    stay = t.min_showing_scans, t.min_showing_s, glimpses, arrivals
+    possible[possible] = persistent(this.points[possible], this.scan[possible], this, *sight_limits, *stay)
     in_vain = (seen.at == 0) & (seen.through + seen.open >= t.min_confirming_scans)
     return confirmed & possible, possible, in_vain & possible
 

@@ -9,6 +9,8 @@ import numpy as np
 from .results import KnownChange, KnownState
 from .submap import AT, GLIMPSED, OPEN, THROUGH, DepthImage, Submap
 
+NEVER = np.iinfo(np.int64).max
+
 
 @dataclass(frozen=True, eq=False)
 class Sight:
@@ -59,6 +61,7 @@ def persistent(
     min_scans: int,
     min_s: float,
     glimpses: bool,
+    arrivals: bool,
 ) -> np.ndarray:
     """Which points (N, 3), each of scan (N,) of its own submap, stayed where they were through their own visit.
 
@@ -66,22 +69,32 @@ def persistent(
     ever looked through by them; a walking person is gone in the next scan, a slow car a second later, and leaves in
     the wind let beams through. That nothing looks through is not enough: before the sky there is no return behind a
     walker's head. Scans of other visits must not be asked: they did look through what appeared later. glimpses count
-    as meetings for a thing that is sure already: its edges are seldom met by nine pixels.
+    as meetings for a thing that is sure already: its edges are seldom met by nine pixels. arrivals: what came in the
+    middle of the visit, and was met for twice as long since nothing looked through it any more, has stayed too.
     """
     out = np.zeros(len(points), dtype=bool)
     visit = own.visit[scan]
     for v in np.unique(visit):
         of_visit = np.flatnonzero(visit == v)
         through, at = np.zeros((2, len(of_visit)), dtype=np.int16)
-        first, last = np.full(len(of_visit), np.iinfo(np.int64).max), np.zeros(len(of_visit), dtype=np.int64)
-        for i in np.flatnonzero(own.visit == v):
+        at_since = np.zeros(len(of_visit), dtype=np.int16)  # it was looked through last
+        first, last = np.full(len(of_visit), NEVER), np.zeros(len(of_visit), dtype=np.int64)
+        first_since = np.full(len(of_visit), NEVER)
+        scans = np.flatnonzero(own.visit == v)
+        for i in scans[np.argsort(own.stamp_ns[scans], kind="stable")]:
             seen = own.images[i].look_at(points[of_visit], margin_m, range_m)
-            through += seen == THROUGH
-            met = (seen == AT) | (glimpses & (seen == GLIMPSED))
+            passed, met = seen == THROUGH, (seen == AT) | (glimpses & (seen == GLIMPSED))
+            through += passed
             at += met
+            at_since += met
+            at_since[passed], first_since[passed] = 0, NEVER
             first[met] = np.minimum(first[met], own.stamp_ns[i])
-            last[met] = np.maximum(last[met], own.stamp_ns[i])
-        out[of_visit] = (at >= min_scans) & (through * 2 < at) & (last - first >= min_s * 1e9)
+            first_since[met] = np.minimum(first_since[met], own.stamp_ns[i])
+            last[met] = own.stamp_ns[i]
+        stayed = (at >= min_scans) & (through * 2 < at) & (last - first >= min_s * 1e9)
+        if arrivals:
+            stayed |= (at_since >= min_scans) & (last - first_since >= 2 * min_s * 1e9)
+        out[of_visit] = stayed
     return out
 
 
