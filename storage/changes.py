@@ -124,11 +124,22 @@ class ChangeStore:
             self._update(change_id, values)
 
     def merge(self, part_id: int, whole_id: int) -> None:
-        """A change turns out to be part of another: its points go there, and it ends, superseded by it."""
+        """A change turns out to be part of another: its points and its history go there, and its row goes.
+
+        `merged_changes` keeps where it went.
+        """
         with self._db.transaction():
             part, whole = self.get(part_id), self.get(whole_id)
             self.extend(whole_id, part.points, max(part.confidence, whole.confidence), whole.evidence)
-            self._update(part_id, {"state": "ended", "superseded_by": whole_id})
+            for column, table in (
+                ("change_id", "observations"),
+                ("superseded_by", "changes"),
+                ("whole_id", "merged_changes"),
+            ):
+                self._db.write(f"UPDATE {table} SET {column} = ? WHERE {column} = ?", (whole_id, part_id))
+            row = {"part_id": part_id, "whole_id": whole_id, "merged_host_ns": time.time_ns()}
+            self._db.insert("merged_changes", row)
+            self._db.write("DELETE FROM changes WHERE id = ?", (part_id,))
 
     def observe(
         self,

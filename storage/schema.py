@@ -107,8 +107,7 @@ CREATE TABLE changes (                 -- one object that appeared or disappeare
     revision             INTEGER NOT NULL UNIQUE,  -- grows with each new or altered row: read on from the last seen
     polarity             TEXT NOT NULL CHECK (polarity IN ('appeared', 'disappeared')),
     state                TEXT NOT NULL DEFAULT 'present' CHECK (state IN ('present', 'ended')),
-                                       -- ended: undone since (what appeared has gone, what disappeared is back),
-                                       -- or part of superseded_by, where that is of the same polarity
+                                       -- ended: undone since; what appeared has gone, what disappeared is back
     superseded_by        INTEGER REFERENCES changes (id),  -- the change that ended this one, if there is one
     map_id               INTEGER NOT NULL,  -- this and the next three: ids of index.db
     session_id           INTEGER NOT NULL,
@@ -183,6 +182,11 @@ DROP VIEW change_history;
 DROP TABLE observations;
 ALTER TABLE observations_2 RENAME TO observations;
 CREATE INDEX observations_by_change ON observations (change_id);
+CREATE TABLE merged_changes (          -- changes that turned out to be parts of others, and are no rows any more
+    part_id        INTEGER PRIMARY KEY,
+    whole_id       INTEGER NOT NULL REFERENCES changes (id),
+    merged_host_ns INTEGER NOT NULL
+) STRICT;
 CREATE VIEW change_history AS          -- for people: which visit saw which change, in which state
 SELECT o.change_id, c.polarity, o.kind AS seen_as, o.session_id, o.scene_id, o.visit, o.time_ns,
        round(o.share_still, 2) AS share_still, round(o.share_undone, 2) AS share_undone,

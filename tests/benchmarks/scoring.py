@@ -63,8 +63,7 @@ def score(data: Path, truth: Path) -> Score:
     """
     staged = json.loads((truth / "changes.json").read_text())
     with Store.open_reader(data) as store:
-        found = [change for change in store.changes.changes() if not _part_of_another(change, store)]
-        path = store.index.trajectory()
+        found, path = store.changes.changes(), store.index.trajectory()
     result = Score([f"{change['kind']} {change['polarity']}" for change in staged], [], [])
     matched: set[int] = set()
     for change in staged:
@@ -87,12 +86,6 @@ def trajectory_error(stamp_ns: np.ndarray, T_map_sensor: np.ndarray, truth: Path
     at = np.abs(true_ns[None] - stamp_ns[:, None]).argmin(axis=1)
     error = np.linalg.norm(T_map_sensor[:, :3, 3] - true[at, 1:4], axis=1)
     return float(np.sqrt((error**2).mean())), float(error.max())
-
-
-def _part_of_another(change: ChangeObject, store: Store) -> bool:
-    """Whether it was merged into another change since."""
-    whole = change.superseded_by
-    return whole is not None and store.changes.get(whole, with_points=False).polarity == change.polarity
 
 
 def _confirmable(change: dict) -> np.ndarray:
