@@ -72,6 +72,18 @@ class ChangeManager:
         """Metadata of all changes of at least n points."""
         return self._store.publish_change_list(n)
 
+    def update_map(
+        self, points: np.ndarray, taken: np.ndarray, map_id: int, until: tuple[int, int]
+    ) -> np.ndarray:
+        """Which points (N, 3) float32 of older scans still stand, by all that was known to be gone at a time.
+
+        taken (N, 2) int64: session and sensor time of each point's scan; until: session and sensor time.
+        """
+        from .detection.erasure import standing  # compiled loops: not for the process of the frame loop
+
+        box = points.min(axis=0), points.max(axis=0)
+        return standing(points, np.arange(len(points)), taken, self.erasures(map_id, box, until))
+
     def erasures(
         self, map_id: int, box: tuple[np.ndarray, np.ndarray], until: tuple[int, int]
     ) -> list[Erasure]:

@@ -132,6 +132,34 @@ def changes(data: Path, form: str, points: bool, min_points: int) -> None:
         click.echo(report.changes_json(found, with_points=points))
 
 
+@cli.command(context_settings={"ignore_unknown_options": True})  # -3.5 is a coordinate
+@click.argument("x", type=float)
+@click.argument("y", type=float)
+@click.argument("z", type=float)
+@DATA
+@CONFIG
+@click.option("--radius", default=0.3, show_default=True, help="Of the place, metres.")
+@click.option("--map", "map_id", type=int, help="Of which map; the newest without it.")
+@click.option("--format", "form", type=click.Choice(["table", "json"]), default="table", show_default=True,
+              help="For people, or for programs.")  # fmt: skip
+def place(
+    x: float, y: float, z: float, data: Path, config_path: Path | None, radius: float, map_id: int | None, form: str
+) -> None:
+    """Say what each visit saw at X Y Z (metres, map frame): the same as before, a change, or nothing."""
+    import numpy as np
+
+    from ..storage.store import Store
+    from . import report
+    from .places import place_history
+
+    config = load_config(config_path)
+    with Store.open_reader(data) as store:
+        maps = [scene.map_id for scene in store.index.scenes()]
+        map_id = map_id if map_id is not None else max(maps, default=0)
+        history = place_history(store, map_id, np.array([x, y, z]), radius, config.detection)
+    click.echo(report.place_json(history) if form == "json" else report.place_table(history))
+
+
 @cli.command()
 @DATA
 @click.option("--session", type=int, help="Of one session only.")

@@ -6,12 +6,17 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import datetime, timezone
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..storage.changes import ChangeObject
+
+if TYPE_CHECKING:  # its compiled loops take a second to import
+    from .places import PlaceSeen
 
 DECIMALS = 4  # of metres in JSON and CSV: a tenth of a millimetre, where the sensor knows centimetres
 SECOND_NS = 1_000_000_000
@@ -26,7 +31,29 @@ def changes_table(changes: Sequence[ChangeObject]) -> str:
         x, y, z = (f"{value:.2f}" for value in change.centroid)
         numbers = (str(change.n_points), str(change.scene), str(change.visit))
         rows.append((str(change.id), change.polarity, change.state, x, y, z, *numbers, _utc(change)))
-    left = {1, 2, 9}
+    return _aligned(rows, left={1, 2, 9})
+
+
+def place_table(history: Sequence[PlaceSeen]) -> str:
+    """Aligned columns for people: what each visit saw of a place."""
+    if not history:
+        return "no visit came near"
+    rows = [("session", "scene", "visit", "scans", "occupied", "free", "state", "against the last")]
+    for seen in history:
+        shares = f"{seen.share_occupied:.0%}", f"{seen.share_free:.0%}"
+        numbers = str(seen.session), str(seen.scene), str(seen.visit), str(seen.n_scans)
+        rows.append((*numbers, *shares, seen.state, seen.verdict))
+    return _aligned(rows, left={6, 7})
+
+
+def place_json(history: Sequence[PlaceSeen]) -> str:
+    """A JSON list, one visit on each line, under the names of PlaceSeen."""
+    lines = [json.dumps(asdict(seen)) for seen in history]
+    return "[" + ",".join(f"\n  {line}" for line in lines) + "\n]" if lines else "[]"
+
+
+def _aligned(rows: list[tuple[str, ...]], left: set[int]) -> str:
+    """Columns two spaces apart, those named aligned to the left, the others to the right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = []
     for row in rows:

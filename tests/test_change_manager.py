@@ -104,6 +104,16 @@ def test_a_removed_object_is_erased_from_older_scans_only(store):
     assert np.bincount(submap.scan).tolist() == [len(wall), len(bag) + len(wall)]
 
 
+def test_planners_bring_points_of_their_own_up_to_date(store):
+    manager, bag, wall = ChangeManager(store), block(3, 4), block(6, 4, size=1.0)
+    manager.record(found("disappeared", bag, 50, 60), finding(2))
+    points = np.vstack([bag, bag, wall])
+    taken = np.repeat([[1, 20 * S], [1, 80 * S], [1, 20 * S]], [len(bag), len(bag), len(wall)], axis=0)
+    stands = manager.update_map(points, taken, 1, (1, 100 * S))
+    assert not stands[: len(bag)].any()
+    assert stands[len(bag) :].all()
+
+
 def test_what_was_not_yet_known_at_the_time_is_not_erased(store):
     manager, bag, wall = ChangeManager(store), block(3, 4), block(6, 4, size=1.0)
     manager.record(found("disappeared", bag, 50, 60), finding(2))

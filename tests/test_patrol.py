@@ -57,6 +57,23 @@ def test_the_points_of_a_change_cover_what_was_to_be_seen_of_it(capture, patrol)
         assert (distance.min(axis=0) < 0.25).mean() > 0.95  # and hardly anything beside it
 
 
+def test_a_place_is_seen_as_it_was_and_as_it_became_and_nothing_is_said_of_what_no_beam_reached(capture, patrol):
+    (crate,) = [c for c in json.loads((capture.truth / "changes.json").read_text()) if c["polarity"] == "disappeared"]
+
+    def states(x, y, z):
+        arguments = [f"{value:.3f}" for value in (x, y, z)]
+        result = CliRunner().invoke(cli, ["place", *arguments, "--data", str(patrol[0]), "--format", "json"])
+        assert result.exit_code == 0, result.output
+        return json.loads(result.output)
+
+    history = states(*crate["centroid"])
+    assert [seen["state"] for seen in history if seen["visit"] == 1][:1] == ["occupied"]
+    assert history[-1]["state"] == "free"
+    assert "changed" in [seen["verdict"] for seen in history]
+    x, y, z = crate["centroid"]
+    assert {seen["state"] for seen in states(x, y, z - 5.0)} == {"not observed"}  # under the ground
+
+
 def test_key_scans_are_where_the_sensor_was(capture, patrol):
     result = CliRunner().invoke(cli, ["trajectory", "--data", str(patrol[0])])
     ours = np.loadtxt(result.output.splitlines())

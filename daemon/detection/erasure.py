@@ -11,16 +11,23 @@ from .submap import Submap
 
 
 def update_map(submap: Submap, session: np.ndarray, erasures: list[Erasure]) -> Submap:
-    """The submap without the points of removed objects; session (S,) of its scans.
+    """The submap without the points of removed objects; session (S,) of its scans."""
+    stands = standing(submap.points, submap.scan, np.column_stack([session, submap.stamp_ns]), erasures)
+    return submap if stands.all() else submap.only(stands)
 
-    What an object left in scans taken before it was gone is erased; scans taken after it came back stay. Only what
-    disappeared matters: what appeared is in the scans taken since.
+
+def standing(points: np.ndarray, scan: np.ndarray, taken: np.ndarray, erasures: list[Erasure]) -> np.ndarray:
+    """Which points (N, 3) float32 are not of a removed object.
+
+    scan (N,) is the index of each point's scan; taken (S, 2) int64: a scan's session and sensor time. What an object
+    left in scans taken before it was gone is erased; scans taken after it came back stay. Only what disappeared
+    matters: what appeared is in the scans taken since.
     """
-    stands = np.ones(len(submap.points), dtype=bool)
+    stands = np.ones(len(points), dtype=bool)
     for gone in erasures:
         lower, upper = bounds(gone.points)
-        older = (session < gone.session) | ((session == gone.session) & (submap.stamp_ns < gone.gone_ns))
-        near = np.flatnonzero(inside(submap.points, lower - np.float32(ERASE_M), upper + np.float32(ERASE_M)))
-        near = near[older[submap.scan[near]]]
-        stands[near] = changed(submap.points[near], gone.points, ERASE_M, 1)
-    return submap if stands.all() else submap.only(stands)
+        older = (taken[:, 0] < gone.session) | ((taken[:, 0] == gone.session) & (taken[:, 1] < gone.gone_ns))
+        near = np.flatnonzero(inside(points, lower - np.float32(ERASE_M), upper + np.float32(ERASE_M)))
+        near = near[older[scan[near]]]
+        stands[near] = changed(points[near], gone.points, ERASE_M, 1)
+    return stands
