@@ -111,6 +111,8 @@ class ChangeManager:
         place is seen to be as before, though too little of it for a change of its own, has ended too.
         """
         for state in states:
+            if self._store.whole_of(state.change_id) != state.change_id:
+                continue  # this visit has found it to be a part of another
             change = self._store.get(state.change_id, with_points=False)
             last = self._store.history(state.change_id)[-1]
             same_visit = all(last[f"{key}_id" if key != "visit" else key] == value for key, value in finding_of.items())

@@ -174,6 +174,12 @@ class ChangeStore:
             raise StorageError(f"there is no change {change_id}")
         return found[0]
 
+    def whole_of(self, change_id: int) -> int:
+        """The id under which a change is stored now: its own, or that of the change it was merged into."""
+        return self._db.value(
+            "SELECT coalesce((SELECT whole_id FROM merged_changes WHERE part_id = ?), ?)", (change_id, change_id)
+        )
+
     def changes(
         self,
         *,

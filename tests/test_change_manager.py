@@ -7,7 +7,7 @@ import pytest
 
 from revisitd.daemon.changes import ChangeManager, Finding
 from revisitd.daemon.detection.erasure import update_map
-from revisitd.daemon.detection.results import DetectedObject
+from revisitd.daemon.detection.results import DetectedObject, KnownState
 from revisitd.daemon.detection.submap import Submap
 from revisitd.storage.store import Store
 
@@ -81,6 +81,8 @@ def test_two_ends_of_a_car_are_one_once_a_third_view_joins_them(store):
     assert manager.record(found("appeared", block(3, 0, size=1.0), 10, 62), finding(2))
     assert not manager.record(found("appeared", block(1.3, 0, size=1.5), 10, 64), finding(2))
     (whole,) = store.changes()
+    assert store.whole_of(2) == store.whole_of(1) == whole.id
+    manager.note([KnownState(2, 1.0, 0.0)], {"session": 1, "scene": 1, "visit": 2}, 70 * S)  # asked before it merged
     assert [row["kind"] for row in store.history(whole.id)] == ["appeared", "appeared", "still"]
     np.testing.assert_allclose([whole.box_min[0], whole.box_max[0]], [0, 4], atol=0.1)
 
