@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..storage.changes import Change, ChangeObject, ChangeStore
+from .confidence import confidence
 from .detection.results import ERASE_M, DetectedObject, Erasure, KnownChange, KnownState
 
 TOUCH_M = 0.4  # objects nearer than the cluster distance are one
@@ -44,14 +45,14 @@ class ChangeManager:
         holds. One that it undoes (what appeared has gone again) is marked as ended by it.
         """
         touching = self._touching(found.points, finding.map_id)
-        confidence, evidence = _confidence(found), _evidence(found)
+        sure, evidence = confidence(found), _evidence(found)
         same = [(c, share) for c, share in touching if c.polarity == found.polarity and c.state == "present"]
         # Of the same interval: another view of the same moment. However little of the two touches, they are one.
         views = [c for c, _ in same if c.session == finding.session and found.before_ns < c.first_seen_ns]
         if views:
             views.sort(key=lambda change: -change.n_points)
             known, parts = views[0], views[1:]
-            self._store.extend(known.id, found.points, max(confidence, known.confidence), evidence)
+            self._store.extend(known.id, found.points, max(sure, known.confidence), evidence)
             for part in parts:
                 self._store.merge(part.id, known.id)
             self._observe(known, "still", found, finding)
@@ -60,7 +61,7 @@ class ChangeManager:
         if again:
             self._observe(max(again, key=lambda change: change.n_points), "still", found, finding)
             return False
-        change_id = self._store.add(_change(found, finding, confidence, evidence))
+        change_id = self._store.add(_change(found, finding, sure, evidence))
         for other, share in touching:
             # Only what was there before: a door that opens disappears here and appears beside in one interval.
             older = (other.session, other.first_seen_ns) <= (finding.before_session, found.before_ns)
@@ -151,21 +152,17 @@ def _touch_share(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.isfinite(distance).mean())
 
 
-def _confidence(found: DetectedObject) -> float:
-    """An ordering from 0 to 1, not yet a probability: more scans that agree, and more of the object confirmed."""
-    agreeing = min(found.n_confirming, found.n_seen_by)
-    return (1.0 - 0.5**agreeing) * (found.n_confirmed / len(found.points)) ** 0.25
-
-
-def _evidence(found: DetectedObject) -> dict[str, int]:
+def _evidence(found: DetectedObject) -> dict[str, float]:
     return {
         "points_confirmed": found.n_confirmed,
+        "share_confirmed": round(found.n_confirmed / len(found.points), 3),
         "scans_showing_it": found.n_seen_by,
         "scans_looking_through": found.n_confirming,
+        "beyond_tau_m": round(found.beyond_tau_m, 3),
     }
 
 
-def _change(found: DetectedObject, finding: Finding, confidence: float, evidence: dict[str, int]) -> Change:
+def _change(found: DetectedObject, finding: Finding, sure: float, evidence: dict[str, float]) -> Change:
     return Change(
         polarity=found.polarity,
         map_id=finding.map_id,
@@ -175,7 +172,7 @@ def _change(found: DetectedObject, finding: Finding, confidence: float, evidence
         first_seen_ns=found.after_ns,
         first_seen_host_ns=finding.after_host_ns,
         points=found.points,
-        confidence=confidence,
+        confidence=sure,
         evidence=evidence,
         alignment_residual_m=finding.alignment_residual_m,
         model_id=finding.model_id,

@@ -10,7 +10,7 @@ import numpy as np
 
 from .detection.results import DetectedObject
 
-WEIGHTS = (1.0, 1.0, 1.0, 1.0, -5.0)
+WEIGHTS = (1.11, 1.67, 0.04, -1.85, -5.9)
 CERTAIN = 0.99  # what a model fitted on virtual worlds may say of the real one, at most
 
 

@@ -29,7 +29,7 @@ def block(x, y, size=0.5, z=0.0):
 
 
 def found(polarity, points, before_s, after_s):
-    return DetectedObject(polarity, points, before_s * S, after_s * S, len(points), 5, 5)
+    return DetectedObject(polarity, points, before_s * S, after_s * S, len(points), 5, 5, 0.4)
 
 
 def finding(visit, scene=1, session=1, before_session=1):

@@ -23,6 +23,7 @@ COMPLETE_M = 1.5  # ... and by looked-through points of any distance, so far aro
 COMPLETE_STEP_M = 0.2  # without a gap wider than this
 COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
 COUNTERPART_SHARE = 0.2  # also against the size of what came
+FAR_M = 2.0  # a distance to the other submap beyond this is not measured
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
 
@@ -189,9 +190,19 @@ def _described(
     before, after = (other_ns, own_ns) if polarity == "appeared" else (own_ns, other_ns)
     points = np.concatenate([this.points[sure], this.points[member], more])
     points = points[thin(points)]
+    beyond_m = _distance_m(this.points[sure], other) - t.tau_m
     return DetectedObject(
-        polarity, points, int(before.max()), int(after.min()), len(sure), len(own_scans), len(through)
+        polarity, points, int(before.max()), int(after.min()), len(sure), len(own_scans), len(through), beyond_m
     )
+
+
+def _distance_m(points: np.ndarray, other: Submap) -> float:
+    """Median distance of some points to the other submap, at most FAR_M."""
+    lower, upper = bounds(points)
+    near = other.around(lower - np.float32(FAR_M), upper + np.float32(FAR_M)).points
+    if not len(near):
+        return FAR_M
+    return float(np.median(np.minimum(cKDTree(near).query(points, distance_upper_bound=FAR_M)[0], FAR_M)))
 
 
 def _first_of_voxels(points: np.ndarray) -> np.ndarray:

@@ -67,6 +67,7 @@ class DetectedObject:
     n_confirmed: int  # points whose place the other visit looked through
     n_seen_by: int  # scans of its own submap that saw it
     n_confirming: int  # scans of the other submap that looked through its place
+    beyond_tau_m: float  # how far beyond tau its confirmed points are from the other submap, median; below 0: within
 
 
 @dataclass(frozen=True, eq=False)
