@@ -108,13 +108,20 @@ def _evidence(
     one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it."""
     sight_limits = (t.occlusion_margin_m, t.occlusion_range_m)
     seen = latest_sight(this.points, other, *sight_limits, t.min_confirming_scans)
-    confirmed = (seen.through >= t.min_confirming_scans) & (seen.through > seen.at)
-    possible = confirmed | (seen.at <= seen.through)
     arrivals = this.visit.min() > other.visit.max()  # what left in the middle of an older visit was only passing by
     stay = t.min_showing_scans, t.min_showing_s, glimpses, arrivals
-    possible[possible] = persistent(this.points[possible], this.scan[possible], this, *sight_limits, *stay)
+
+    def stayed(asked: np.ndarray) -> np.ndarray:
+        asked[asked] = persistent(this.points[asked], this.scan[asked], this, *sight_limits, *stay)
+        return asked
+
+    confirmed = stayed((seen.through >= t.min_confirming_scans) & (seen.through > seen.at))
+    # What else may belong to an object lies around confirmed points; the rest of the candidates, most of them, wait.
+    possible = seen.at <= seen.through
+    possible[possible] = ~changed(this.points[possible], this.points[confirmed], COMPLETE_M, 1)
+    possible = stayed(possible) | confirmed
     in_vain = (seen.at == 0) & (seen.through + seen.open >= t.min_confirming_scans)
-    return confirmed & possible, possible, in_vain & possible
+    return confirmed, possible, in_vain & possible
 
 
 def _completion(sure: np.ndarray, in_vain: np.ndarray, side: _Side, other: _Side, t: Thresholds) -> np.ndarray:

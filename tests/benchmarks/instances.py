@@ -10,9 +10,8 @@ with other numbers of scans, and the cost of every instance of the patrol, in or
 from __future__ import annotations
 
 import argparse
-import sqlite3
 import sys
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from unittest import mock
 
@@ -20,13 +19,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import plain
+from rerun import detection_on, instances_of
 
 from revisitd.daemon.comparer import Comparer
 from revisitd.daemon.comparison import Comparison, Job
 from revisitd.daemon.config import Config
 from revisitd.daemon.detection import candidates, detector
-from revisitd.daemon.instances import ChangeDetection
-from revisitd.daemon.worker import Instance
+from revisitd.daemon.instances import Rejected
 from revisitd.storage.store import Store
 
 PLAIN = {
@@ -51,17 +50,14 @@ def plainly():
 
 
 def jobs_of(data: Path, config: Config) -> list[Job]:
-    """What the detection process was asked for each instance that was compared, in order."""
-    with sqlite3.connect(data / "index.db") as db:
-        instances = db.execute(
-            "SELECT v.session_id, s.map_id, v.scene_id, v.visit_id, v.number, v.t_in_ns, v.t_out_ns FROM visits v"
-            " JOIN scenes s USING (scene_id) JOIN instances i USING (visit_id) WHERE i.status = 'done'"
-            " ORDER BY visit_id"
-        ).fetchall()
-        (model_id,) = db.execute("SELECT model_id FROM descriptors LIMIT 1").fetchone()
-    with Store.open_reader(data) as store, mock.patch("revisitd.daemon.instances.DetectionProcess"):
-        detection = ChangeDetection(config, store, model_id)
-        return [detection.job(Instance(*row)) for row in instances]
+    """What the detection process is asked for each visit that can be compared, in order."""
+    jobs = []
+    with Store.open_reader(data) as store:
+        detection = detection_on(store, config)
+        for instance in instances_of(store):
+            with suppress(Rejected):
+                jobs.append(detection.job(instance))
+    return jobs
 
 
 def run(comparer: Comparer, job: Job, repeat: int) -> tuple[Comparison, dict[str, float]]:
