@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from revisitd.daemon.config import Config
-from revisitd.daemon.odometry import Health, Odometry
+from revisitd.daemon.odometry import Health, Odometry, SteadyMotion
 from revisitd.drivers.ouster import open_source
 
 virtual = pytest.importorskip("revisitd.drivers.virtual", reason="the virtual sensor needs the extra [sim]")
@@ -79,3 +80,30 @@ def test_a_long_gap_is_lost_and_a_short_one_is_not(drive):
     known.register(frames[10])
     assert known.register(frames[13]).health is Health.GOOD
     assert known.register(frames[25]).health is Health.LOST_GAP
+
+
+def test_the_motion_of_a_sweep_is_not_shaken_by_single_steps_but_turns_at_once():
+    rng = np.random.default_rng(0)
+    steady = SteadyMotion()
+    assert np.array_equal(steady.during(1.0), np.eye(4))
+    for i in range(20):
+        yaw = 0.0 if i < 19 else np.radians(5)
+        tilt = rng.normal(0, np.radians(0.4), 2)
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec([*tilt, yaw]).as_matrix()
+        step[:3, 3] = 0.2, 0.0, rng.normal(0, 0.07)
+        steady.add(step, 1.0)
+    motion = steady.during(1.0)
+    assert abs(motion[2, 3]) < 0.06 and motion[0, 3] == pytest.approx(0.2, abs=0.01)
+    roll, pitch, turned = Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)
+    assert max(abs(roll), abs(pitch)) < 0.4 and turned == pytest.approx(5, abs=0.1)
+    half = steady.during(0.5)
+    np.testing.assert_allclose(half @ half, motion, atol=1e-2)
+
+
+def test_a_motion_over_missing_frames_counts_as_that_of_one():
+    steady = SteadyMotion()
+    step = np.eye(4)
+    step[0, 3] = 0.6
+    steady.add(step, 3.0)
+    assert steady.during(1.0)[0, 3] == pytest.approx(0.2)
