@@ -18,7 +18,7 @@ CACHED_REFERENCES = 3  # scenes overlap at their rims; more than that are never 
 MAX_TURN_DEG = 8.0  # a correction that turns the map further is a wrong match, not drift
 SCAN_VOXEL_RATIO = 1.6  # a scan is thinner than the reference it is registered to
 MAX_SEAM_M = 0.1  # a fix that moves the map further leaves the last key scans where they are no longer true
-MIN_COARSE_TRAVEL_M = 5.0  # metres without a fix before a large drift is looked for
+MIN_COARSE_TRAVEL_M = 5.0  # metres without a fix after which a large drift is looked for at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +78,10 @@ class Localizer:
     def _fix(self, source: small_gicp.PointCloud, predicted: np.ndarray, scenes: list[Scene]) -> Fix:
         """By a known scene; where none matches, by the key scans before."""
         reason = "new place"
-        for scene in scenes[:2]:
-            match = self._register(source, predicted, scene)
+        drifted = self._travel_since_fix_m > MIN_COARSE_TRAVEL_M
+        attempts = [(scene, coarse) for coarse in (drifted, True) for scene in scenes[:2]]
+        for scene, coarse in dict.fromkeys(attempts):
+            match = self._register(source, predicted, scene, coarse)
             reason = self._objection(match, predicted)
             if not reason:
                 self._travel_since_fix_m = 0.0
@@ -94,10 +96,10 @@ class Localizer:
             self._travel_since_fix_m += float(np.linalg.norm(position - self._last_position))
         self._last_position = position
 
-    def _register(self, source: small_gicp.PointCloud, predicted: np.ndarray, scene: Scene) -> _Match:
-        gates = [self._config.gate_m]
-        if self._travel_since_fix_m > MIN_COARSE_TRAVEL_M:
-            gates = [self._config.coarse_gate_m, *gates]
+    def _register(
+        self, source: small_gicp.PointCloud, predicted: np.ndarray, scene: Scene, coarse: bool
+    ) -> _Match:
+        gates = [self._config.coarse_gate_m, self._config.gate_m] if coarse else [self._config.gate_m]
         T = predicted
         target, tree = self._reference(scene)
         for gate in gates:
