@@ -1,0 +1,173 @@
+"""What must be found: once, with the right polarity, and with most of what was to be seen of it."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("revisitd.drivers.virtual.embree", reason="needs the extra [sim]", exc_type=ImportError)
+
+from staged import OS1_64, OS1_128, THRESHOLDS, Outcome, Thing, Visit, compare, drive, house, open_field, submap, yard
+
+from revisitd.daemon.detection.detector import detect
+from revisitd.daemon.detection.erasure import update_map
+from revisitd.daemon.detection.results import Erasure
+from revisitd.drivers.virtual import shapes
+from revisitd.drivers.virtual.mesh import Material, box, tube
+from revisitd.drivers.virtual.vehicles import car
+
+MOST = 0.75  # of the surface that was seen
+SENSORS = pytest.mark.parametrize("metadata", [OS1_64, OS1_128], ids=["OS1-64", "OS1-128"])
+
+
+def rng(seed=3):
+    return np.random.default_rng(seed)
+
+
+def crate(xy=(0.5, 4.0), visits=(1,), kind="crate", **more):
+    return Thing(kind, box((0.5, 0.4, 0.6), Material.WOOD).moved((*xy, 0)), visits, **more)
+
+
+# Small and thin ---------------------------------------------------------------------------------------------------
+
+
+@SENSORS
+@pytest.mark.parametrize("y_m", [3.0, 8.0], ids=["at 3 m", "at 8 m"])
+def test_a_box_of_20_cm_on_the_ground_is_found(metadata, y_m):
+    cube = Thing("cube", box((0.2, 0.2, 0.2), Material.WOOD, (0.5, y_m, 0)), (1,))
+    compare(yard().plus(cube), Visit(metadata=metadata), Visit(metadata=metadata)).expect(appeared={"cube": MOST})
+
+
+@SENSORS
+@pytest.mark.parametrize("y_m", [3.0, 6.0], ids=["at 3 m", "at 6 m"])
+def test_a_pole_of_6_cm_is_found(metadata, y_m):
+    pole = Thing("pole", tube([[0.8, y_m, 0], [0.8, y_m, 2.2]], [0.03] * 2, Material.METAL, 12), (1,))
+    compare(yard().plus(pole), Visit(metadata=metadata), Visit(metadata=metadata)).expect(appeared={"pole": MOST})
+
+
+def test_a_fence_panel_is_found():
+    panel = Thing("panel", shapes.fence_panel(rng()).moved((-0.5, 4.5, 0), yaw=0.2), (1,))
+    compare(yard().plus(panel)).expect(appeared={"panel": MOST})
+
+
+# Seen in part -----------------------------------------------------------------------------------------------------
+
+
+def test_a_person_half_hidden_behind_a_bin_is_found():
+    bin_ = Thing("bin", shapes.bin_(rng(1)).moved((0, 4.0, 0)))
+    person = Thing("person", shapes.person(rng(2)).moved((0.2, 4.9, 0), yaw=-1.5), (1,))
+    compare(yard().plus(bin_, person)).expect(appeared={"person": MOST})
+
+
+@pytest.mark.parametrize("model", ["sedan", "wagon", "van"])
+@pytest.mark.parametrize("visits,polarity", [((1,), "appeared"), ((0,), "disappeared")], ids=["comes", "leaves"])
+def test_a_car_seen_from_one_side_is_one_change(visits, polarity, model):
+    parked = Thing("parked", car(rng(5), model).shut.moved((0.3, 4.2, 0), yaw=0.05), visits)
+    compare(yard().plus(parked)).expect(**{polarity: {"parked": MOST}})
+
+
+def test_a_thing_against_a_wall_is_found():
+    wall = Thing("near wall", box((6, 0.2, 2.0), Material.BRICK, (0, 4.5, 0)))
+    leaning = Thing("case", box((0.5, 0.3, 0.8), Material.PLASTIC, (0.3, 4.2, 0)), (1,))  # 5 cm before the wall
+    compare(yard().plus(wall, leaning)).expect(appeared={"case": MOST})
+
+
+def test_a_flat_thing_against_a_wall_is_found():
+    wall = Thing("near wall", box((6, 0.2, 2.0), Material.BRICK, (0, 4.5, 0)))
+    leaning = Thing("board", box((1.0, 0.15, 1.2), Material.WOOD, (0.3, 4.275, 0)), (1,))  # 5 cm before the wall
+    compare(yard().plus(wall, leaning)).expect(appeared={"board": MOST})
+
+
+# Doors ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_car_door_that_opens_is_found_with_the_place_it_left():
+    made = car(rng(4), "sedan")
+    place = dict(xyz=(0.5, -4.2, 0), yaw=0.0)  # its left door towards the robot
+    world = yard().plus(
+        Thing("body", made.body.moved(**place)),
+        Thing("shut", made.door_shut.moved(**place), (0,)),
+        Thing("open", made.door_open.moved(**place), (1,)),
+    )
+    compare(world).expect(appeared={"open": MOST}, disappeared={"shut": MOST})
+
+
+def test_a_house_door_that_opens_is_found_with_the_place_it_left():
+    world = yard().without("house door").plus(
+        Thing("shut", house().door_shut, (0,)), Thing("open", house().door_open, (1,))
+    )
+    x = house().door_xyz[0]
+    past = Visit((x - 3, 4.0), (x + 3, 4.0))
+    compare(world, past, past).expect(appeared={"open": MOST}, disappeared={"shut": MOST})
+
+
+# Coming, going, moving ----------------------------------------------------------------------------------------------
+
+
+@SENSORS
+def test_a_thing_taken_away_is_found(metadata):
+    outcome = compare(yard().plus(crate(visits=(0,))), Visit(metadata=metadata), Visit(metadata=metadata))
+    outcome.expect(disappeared={"crate": MOST})
+
+
+@pytest.mark.parametrize("step", [(1.0, 0.0), (0.0, 1.0)], ids=["aside", "away"])
+def test_a_thing_moved_by_a_metre_goes_and_comes(step):
+    before, after = (0.5, 4.0), (0.5 + step[0], 4.0 + step[1])
+    world = yard().plus(crate(before, (0,), "here"), crate(after, (1,), "there"))
+    compare(world).expect(appeared={"there": MOST}, disappeared={"here": MOST})
+
+
+@pytest.mark.parametrize("visits,polarity", [((1,), "appeared"), ((0,), "disappeared")], ids=["comes", "leaves"])
+def test_a_change_at_the_edge_of_what_is_compared_is_found(visits, polarity):
+    far_wall = Thing("far wall", box((40, 0.3, 4), Material.BRICK, (0, 22.5, 0)))
+    parked = Thing("parked", car(rng(5)).shut.of(Material.PAINT).moved((0.3, 17.3, 0)), visits)
+    compare(open_field().plus(far_wall, parked)).expect(**{polarity: {"parked": MOST}})
+
+
+def test_a_thing_put_down_in_the_middle_of_a_visit_is_found():
+    compare(yard().plus(crate(since=0.4))).expect(appeared={"crate": MOST})
+
+
+# Three visits -------------------------------------------------------------------------------------------------------
+
+
+def third_visit(world):
+    """What the third visit is told to have changed, by a map that knows what the second one found gone."""
+    first, second, third = (drive(world, k) for k in range(3))
+    gone = [o for o in detect(submap(first), submap(second), THRESHOLDS).objects if o.polarity == "disappeared"]
+    known = submap(first, second)
+    erasures = [Erasure(o.points, 1, o.after_ns) for o in gone]
+    known = update_map(known, np.ones(len(known.stamp_ns), int), erasures)
+    return Outcome(detect(known, submap(third), THRESHOLDS), second, third), gone
+
+
+def test_what_is_known_to_be_gone_is_not_found_gone_again():
+    outcome, gone = third_visit(yard().plus(crate(visits=(0,))))
+    assert len(gone) == 1
+    outcome.expect()
+
+
+def test_what_came_back_on_the_third_visit_is_found():
+    outcome, _ = third_visit(yard().plus(crate(visits=(0, 2))))
+    outcome.expect(appeared={"crate": MOST})
+
+
+def test_what_came_on_the_second_visit_is_found_gone_on_the_third():
+    outcome, gone = third_visit(yard().plus(crate(visits=(1,))))
+    assert not gone
+    outcome.expect(disappeared={"crate": MOST})
+
+
+def test_what_came_on_the_second_visit_and_stays_is_not_found_again():
+    outcome, _ = third_visit(yard().plus(crate(visits=(1, 2))))
+    outcome.expect()
+
+
+def test_a_third_visit_tells_apart_what_went_before_and_what_went_now():
+    world = yard().plus(
+        crate((-1.5, 4.0), (0,), "gone before"),
+        crate((0.5, 4.5), (0, 1), "gone now"),
+        crate((2.0, 5.0), (0, 2), "back again"),
+        crate((0.0, -3.5), (2,), "new"),
+    )
+    outcome, gone = third_visit(world)
+    assert len(gone) == 2
+    outcome.expect(appeared={"back again": MOST, "new": MOST}, disappeared={"gone now": MOST})
