@@ -76,6 +76,17 @@ def test_a_flat_thing_against_a_wall_is_found():
     compare(yard().plus(wall, leaning)).expect(appeared={"board": MOST})
 
 
+@pytest.mark.parametrize("y_m", [3.5, 7.0], ids=["at 3.5 m", "at 7 m"])
+def test_a_fallen_tree_is_found(y_m):
+    tree = Thing("fallen tree", shapes.fallen_tree(rng(7)).moved((0.3, y_m, 0), yaw=0.3), (1,))
+    compare(yard().plus(tree)).expect(appeared={"fallen tree": MOST})
+
+
+def test_a_thing_is_found_from_another_lane():
+    world = yard().plus(Thing("crate", shapes.crate(rng(7)).moved((0.3, 4.5, 0), yaw=0.3), (1,)))
+    compare(world, second=Visit((-3, 2), (3, 2))).expect(appeared={"crate": MOST})
+
+
 # Doors ------------------------------------------------------------------------------------------------------------
 
 
@@ -123,7 +134,7 @@ def test_a_change_at_the_edge_of_what_is_compared_is_found(visits, polarity):
 
 
 def test_a_thing_put_down_in_the_middle_of_a_visit_is_found():
-    compare(yard().plus(crate(since=0.4))).expect(appeared={"crate": MOST})
+    compare(yard().plus(crate(since=0.4)), second=Visit(n_scans=10, every_s=0.6)).expect(appeared={"crate": MOST})
 
 
 # Three visits -------------------------------------------------------------------------------------------------------
