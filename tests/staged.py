@@ -166,7 +166,12 @@ def submap(*visits: Seen) -> Submap:
 def compare(world: World, first: Visit = PAST, second: Visit = PAST) -> "Outcome":
     """Two visits to a world, numbers 0 and 1, compared."""
     before, after = drive(world, 0, first), drive(world, 1, second)
-    return Outcome(detect(submap(before), submap(after), THRESHOLDS), before, after)
+    return Outcome(detected(submap(before), submap(after)), before, after)
+
+
+def detected(cumulative: Submap, recent: Submap) -> Detection:
+    """What the detector says with the default settings; no scans are left that a submap was not made of."""
+    return detect(cumulative, recent, THRESHOLDS, cumulative.around, recent.around)
 
 
 class _Moment:
