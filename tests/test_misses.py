@@ -32,8 +32,8 @@ def crate(xy=(0.5, 4.0), visits=(1,), kind="crate", **more):
 
 LOW_AND_FAR = pytest.mark.xfail(
     strict=True,
-    reason="of 48 voxels the ground takes 27, and 8 of the 21 others are not confirmed (the beam that passes over the "
-    "ground ends on it, less than 0.3 m behind): 13 are fewer than min_points, 20",
+    reason="of 45 voxels the ground takes 19, and 11 of the 26 others are not confirmed (a beam through the lower half "
+    "ends on the ground less than 0.3 m behind): 15 are fewer than min_points, 20",
 )
 
 
@@ -80,7 +80,7 @@ def test_a_large_van_of_which_one_side_is_seen_is_one_change(visits, polarity):
 @pytest.mark.xfail(
     strict=True,
     reason="what is seen through the panes (the roof from below, the far side) lies 0.45 to 1.35 m from the skin and "
-    "becomes 1 to 4 objects of 20 to 550 points: clusters end at gaps of 0.4 m",
+    "becomes an object of its own (35 points in the sedan, 465 confirmed in the van): clusters end at gaps of 0.4 m",
 )
 @pytest.mark.parametrize("model,visits,polarity", [("sedan", (1,), "appeared"), ("van", (0,), "disappeared")])
 def test_a_car_with_panes_is_one_change(visits, polarity, model):
@@ -96,7 +96,7 @@ def test_a_thing_against_a_wall_is_found():
 
 @pytest.mark.xfail(
     strict=True,
-    reason="its front is 20 cm from the wall, nearer than tau (0.3 m) and than the margin of a look through: of 1128 "
+    reason="its front is 20 cm from the wall, nearer than tau (0.3 m) and than the margin of a look through: of 1174 "
     "voxels that are not ground none is a candidate",
 )
 def test_a_flat_thing_against_a_wall_is_found():
@@ -107,18 +107,19 @@ def test_a_flat_thing_against_a_wall_is_found():
 
 @pytest.mark.xfail(
     strict=True,
-    reason="persistent() wants each point met by 3 scans: the sides of what is passed near are met by 1 or 2 (half of "
-    "the points, none of them ever looked through) and stay out of the object, 0.63 covered",
+    reason="persistent() wants each point met by 3 scans; what is passed so near, with 1.2 m between scans, is met by 1 "
+    "or 2 and never looked through: of 399 confirmed voxels 85 are left at 1.7 m (0.50 covered), 3 of 332 at 1.4 m",
 )
-def test_a_box_beside_the_path_is_found_with_its_sides():
-    low = Thing("box", box((0.6, 0.6, 0.5), Material.WOOD, (0, 2.0, 0)), (1,))
+@pytest.mark.parametrize("y_m", [1.4, 1.7], ids=["at 1.4 m", "at 1.7 m"])
+def test_a_box_beside_the_path_is_found(y_m):
+    low = Thing("box", box((0.6, 0.6, 0.5), Material.WOOD, (0, y_m, 0)), (1,))
     compare(yard().plus(low), second=Visit(n_scans=6, every_s=1.0)).expect(appeared={"box": MOST})
 
 
 LEAVES = pytest.mark.xfail(
     strict=True,
-    reason="leaves are looked through by their own visit: persistent() keeps 518 of 908 confirmed voxels at 7 m, ground "
-    "takes the lowest eighth",
+    reason="found twice over: leaves that their own visit looks through part it in two clusters of 46 and 590 confirmed "
+    "points (619 of 1119 confirmed voxels persist), each completed by the other's points to 775 and 954",
 )
 
 
@@ -183,7 +184,7 @@ def test_a_change_at_the_edge_of_what_is_compared_is_found(visits, polarity):
 @pytest.mark.xfail(
     strict=True,
     reason="persistent() counts looks from before it came: met by 6 scans, looked through by the 4 before, and "
-    "4 * 2 < 6 is false; 22 of 397 confirmed voxels are left",
+    "4 * 2 < 6 is false; 17 of 392 confirmed voxels are left",
 )
 def test_a_thing_put_down_in_the_middle_of_a_visit_is_found():
     compare(yard().plus(crate(since=0.4)), second=Visit(n_scans=10, every_s=0.6)).expect(appeared={"crate": MOST})
