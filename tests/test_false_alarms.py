@@ -53,7 +53,7 @@ def test_people_who_stand_for_a_second_are_no_change():
 @pytest.mark.xfail(
     strict=True,
     reason="eight people 0.83 m apart at 1.1 m/s: a place is met by 3 or more of 8 scans over 2 s, by others each "
-    "time, and looked through by fewer than half as many: persistent() lets 1330 points pass as one object and 475 as three more",
+    "time, and looked through by fewer than half as many: persistent() passes 1330 points as one object, 475 as three",
 )
 def test_people_who_walk_in_a_file_are_no_change():
     people = [walker([(-9 + 0.83 * k, 4), (8 + 0.83 * k, 4)], 1, 1.1, seed=k) for k in range(8)]
@@ -63,7 +63,7 @@ def test_people_who_walk_in_a_file_are_no_change():
 CRAWLING = pytest.mark.xfail(
     strict=True,
     reason="at 1 m/s a car of 4.5 m covers a place for 4 s: met by 5 scans, looked through by the 2 after it has "
-    "gone, and 2 * 2 < 5: persistent() does not ask that the last scans still meet it; 648 points confirmed (none at 1.25 m/s)",
+    "gone, and 2 * 2 < 5: persistent() does not ask that the last scans meet it; 648 points confirmed, 0 at 1.25 m/s",
 )
 
 

@@ -107,8 +107,8 @@ def test_a_flat_thing_against_a_wall_is_found():
 
 @pytest.mark.xfail(
     strict=True,
-    reason="persistent() wants each point met by 3 scans; what is passed so near, with 1.2 m between scans, is met by 1 "
-    "or 2 and never looked through: of 399 confirmed voxels 85 are left at 1.7 m (0.50 covered), 3 of 332 at 1.4 m",
+    reason="persistent() wants each point met by 3 scans; what is passed so near, with 1.2 m between scans, is met by "
+    "1 or 2 and never looked through: of 399 confirmed voxels 85 are left at 1.7 m (0.50 covered), 3 of 332 at 1.4 m",
 )
 @pytest.mark.parametrize("y_m", [1.4, 1.7], ids=["at 1.4 m", "at 1.7 m"])
 def test_a_box_beside_the_path_is_found(y_m):
@@ -118,7 +118,7 @@ def test_a_box_beside_the_path_is_found(y_m):
 
 LEAVES = pytest.mark.xfail(
     strict=True,
-    reason="found twice over: leaves that their own visit looks through part it in two clusters of 46 and 590 confirmed "
+    reason="found twice over: leaves that their own visit looks through part it in two clusters of 46 and 590 sure "
     "points (619 of 1119 confirmed voxels persist), each completed by the other's points to 775 and 954",
 )
 
@@ -152,8 +152,10 @@ def test_a_car_door_that_opens_is_found_with_the_place_it_left():
 
 
 def test_a_house_door_that_opens_is_found_with_the_place_it_left():
-    world = yard().without("house door").plus(
-        Thing("shut", house().door_shut, (0,)), Thing("open", house().door_open, (1,))
+    world = (
+        yard()
+        .without("house door")
+        .plus(Thing("shut", house().door_shut, (0,)), Thing("open", house().door_open, (1,)))
     )
     x = house().door_xyz[0]
     past = Visit((x - 3, 4.0), (x + 3, 4.0))
