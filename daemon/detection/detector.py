@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from ..stopwatch import Stopwatch
 from .arrays import bounds, inside
@@ -23,6 +23,7 @@ COMPLETE_M = 1.5  # ... and by looked-through points of any distance, so far aro
 COMPLETE_STEP_M = 0.2  # without a gap wider than this
 COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
 COUNTERPART_SHARE = 0.2  # also against the size of what came
+INSIDE_SHARE = 0.7  # of an object's points within another's outline, seen from above: it is a part of that
 FAR_M = 2.0  # a distance to the other submap beyond this is not measured
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
@@ -97,8 +98,47 @@ def _one_way(
         found = _described(polarity, this, member, sure, more, other.standing, t)
         if found is not None:
             objects.append(found)
+    objects = _joined(objects)
     watch.lap("clusters")
     return Detection(objects, len(this.points), int(confirmed.sum()), watch.seconds)
+
+
+def _joined(objects: list[DetectedObject]) -> list[DetectedObject]:
+    """Objects that are parts of a larger one made one with it: completed until they touch, or inside its outline.
+
+    What is seen through a car's windows lies a metre behind its skin; the leaves of a fallen tree part in clusters.
+    """
+    wholes: list[DetectedObject] = []
+    for part in sorted(objects, key=lambda found: -len(found.points)):
+        index = next((i for i, whole in enumerate(wholes) if _is_part(part, whole)), None)
+        if index is None:
+            wholes.append(part)
+        else:
+            wholes[index] = _both(wholes[index], part)
+    return wholes
+
+
+def _is_part(part: DetectedObject, whole: DetectedObject) -> bool:
+    if not changed(part.points, whole.points, COMPLETE_STEP_M, 1).all():
+        return True
+    try:
+        outline = Delaunay(whole.points[:, :2])
+    except QhullError:  # as thin as a line
+        return False
+    return bool((outline.find_simplex(part.points[:, :2]) >= 0).mean() >= INSIDE_SHARE)
+
+
+def _both(whole: DetectedObject, part: DetectedObject) -> DetectedObject:
+    points = np.concatenate([whole.points, part.points])
+    return replace(
+        whole,
+        points=points[thin(points)],
+        before_ns=max(whole.before_ns, part.before_ns),
+        after_ns=min(whole.after_ns, part.after_ns),
+        n_confirmed=whole.n_confirmed + part.n_confirmed,
+        n_seen_by=max(whole.n_seen_by, part.n_seen_by),
+        n_confirming=max(whole.n_confirming, part.n_confirming),
+    )
 
 
 def _evidence(

@@ -9,6 +9,8 @@ import numpy as np
 from .results import KnownChange, KnownState
 from .submap import AT, GLIMPSED, OPEN, THROUGH, DepthImage, Submap
 
+ARRIVAL_RATIO = 1.4  # of the time asked of a thing that was there all along: since it came
+LEFT_SCANS = 1  # that look through a place after it was met last: what was there has left
 NEVER = np.iinfo(np.int64).max
 
 
@@ -70,14 +72,14 @@ def persistent(
     the wind let beams through. That nothing looks through is not enough: before the sky there is no return behind a
     walker's head. Scans of other visits must not be asked: they did look through what appeared later. glimpses count
     as meetings for a thing that is sure already: its edges are seldom met by nine pixels. arrivals: what came in the
-    middle of the visit, and was met for twice as long since nothing looked through it any more, has stayed too.
+    middle of the visit, and was met for long enough since nothing looked through it any more, has stayed too.
     """
     out = np.zeros(len(points), dtype=bool)
     visit = own.visit[scan]
     for v in np.unique(visit):
         of_visit = np.flatnonzero(visit == v)
         through, at = np.zeros((2, len(of_visit)), dtype=np.int16)
-        at_since = np.zeros(len(of_visit), dtype=np.int16)  # it was looked through last
+        at_since, through_since = np.zeros((2, len(of_visit)), dtype=np.int16)  # looked through last, met last
         first, last = np.full(len(of_visit), NEVER), np.zeros(len(of_visit), dtype=np.int64)
         first_since = np.full(len(of_visit), NEVER)
         scans = np.flatnonzero(own.visit == v)
@@ -88,12 +90,14 @@ def persistent(
             at += met
             at_since += met
             at_since[passed], first_since[passed] = 0, NEVER
+            through_since[met] = 0
+            through_since += passed
             first[met] = np.minimum(first[met], own.stamp_ns[i])
             first_since[met] = np.minimum(first_since[met], own.stamp_ns[i])
             last[met] = own.stamp_ns[i]
-        stayed = (at >= min_scans) & (through * 2 < at) & (last - first >= min_s * 1e9)
+        stayed = (at >= min_scans) & (through * 2 < at) & (last - first >= min_s * 1e9) & (through_since < LEFT_SCANS)
         if arrivals:
-            stayed |= (at_since >= min_scans) & (last - first_since >= 2 * min_s * 1e9)
+            stayed |= (at_since >= min_scans) & (last - first_since >= ARRIVAL_RATIO * min_s * 1e9)
         out[of_visit] = stayed
     return out
 
