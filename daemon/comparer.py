@@ -15,10 +15,10 @@ from ..drivers.frame import Sensor
 from ..storage.datadir import DataDir
 from ..storage.scans import Scan, ScanStore
 from .comparison import Comparison, Job, ScanFacts, Selection
-from .detection.detector import detect
+from .detection.detector import Side, detect, side_of
 from .detection.erasure import update_map
 from .detection.occlusion import state_of
-from .detection.submap import Submap, join
+from .detection.submap import Submap
 from .sensors import Sensors
 from .stopwatch import Stopwatch
 from .submap_build import build_submap
@@ -37,20 +37,25 @@ class Comparer:
     def compare(self, job: Job) -> Comparison:
         """Raises ScanFileError where a scan's file is damaged or gone."""
         watch = Stopwatch()
-        cumulative, facts_c = self.load(job.cumulative, job.range_m)
-        recent, facts_r = self.load(job.recent, job.range_m)
-        watch.lap("load")
-        cumulative = update_map(cumulative, job.cumulative.session[job.cumulative.chosen], job.erasures)
-        watch.lap("update_map")
-        more_cumulative = _More(self, job.cumulative, cumulative, facts_c, job)
-        more_recent = _More(self, job.recent, recent, facts_r, job)
-        detection = detect(cumulative, recent, job.thresholds, more_cumulative.around, more_recent.around)
+        before, n_before, facts_before = self._side(job.cumulative, job, watch)
+        now, n_now, facts_now = self._side(job.recent, job, watch)
+        detection = detect(before, now, job.thresholds)
         watch.restart()
         limits = job.thresholds.occlusion_margin_m, job.thresholds.occlusion_range_m
-        known = [state_of(change, recent.images, *limits) for change in job.known]
+        known = [state_of(change, now.standing.images, *limits) for change in job.known]
         watch.lap("known")
-        sizes = len(cumulative.points), len(recent.points)
-        return Comparison(detection, known, facts_c, facts_r, *sizes, {**watch.seconds, **detection.seconds})
+        seconds = {**watch.seconds, **detection.seconds}
+        return Comparison(detection, known, facts_before, facts_now, n_before, n_now, seconds)
+
+    def _side(self, selection: Selection, job: Job, watch: Stopwatch) -> tuple[Side, int, ScanFacts]:
+        """One side of the comparison; how many points it has with its ground, which are not kept."""
+        submap, facts = self.load(selection, job.range_m)
+        watch.lap("load")
+        submap = update_map(submap, selection.session[selection.chosen], job.erasures)
+        watch.lap("update_map")
+        side = side_of(submap, job.thresholds, _More(self, selection, facts, job).around)
+        watch.lap("ground")
+        return side, len(submap.points), facts
 
     def load(self, selection: Selection, range_m: float) -> tuple[Submap, ScanFacts]:
         """The submap of a selection's chosen scans."""
@@ -67,18 +72,18 @@ class Comparer:
 class _More:
     """A side's scans beyond those of its submap: the nearest ones are loaded when an object wants to be completed."""
 
-    def __init__(self, comparer: Comparer, selection: Selection, submap: Submap, facts: ScanFacts, job: Job):
-        self._comparer, self._submap, self._facts, self._job = comparer, submap, facts, job
+    def __init__(self, comparer: Comparer, selection: Selection, facts: ScanFacts, job: Job):
+        self._comparer, self._facts, self._job = comparer, facts, job
         self._rest = selection.only(~selection.chosen)
         self._loaded: dict[tuple[int, ...], Submap] = {}
 
     def around(self, lower: np.ndarray, upper: np.ndarray) -> Submap:
-        """The points in a box, ground too, of the submap's scans and of those nearest to it."""
+        """The points in a box, ground too, of the scans nearest to it."""
         distance = np.linalg.norm(self._rest.position_m - 0.5 * (lower + upper), axis=1)
         nearest = tuple(np.sort(np.argsort(distance, kind="stable")[:MORE_SCANS]).tolist())
         if nearest not in self._loaded:
             self._loaded = {nearest: self._load(self._rest.only(np.array(nearest, np.int64)))}  # one: it takes 20 MB
-        return join(self._submap.around(lower, upper), self._loaded[nearest].around(lower, upper))
+        return self._loaded[nearest].around(lower, upper)
 
     def _load(self, selection: Selection) -> Submap:
         submap, scans = build_submap(

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from revisitd.daemon.config import Config
-from revisitd.daemon.detection.detector import detect
+from revisitd.daemon.detection.detector import detect, side_of
 from revisitd.daemon.detection.results import DetectedObject, Detection, Thresholds
 from revisitd.daemon.detection.submap import Submap
 from revisitd.daemon.geometry import inverse
@@ -171,7 +171,7 @@ def compare(world: World, first: Visit = PAST, second: Visit = PAST) -> "Outcome
 
 def detected(cumulative: Submap, recent: Submap) -> Detection:
     """What the detector says with the default settings; no scans are left that a submap was not made of."""
-    return detect(cumulative, recent, THRESHOLDS, cumulative.around, recent.around)
+    return detect(side_of(cumulative, THRESHOLDS), side_of(recent, THRESHOLDS), THRESHOLDS)
 
 
 class _Moment:

@@ -62,8 +62,8 @@ def test_people_who_walk_in_a_file_are_no_change():
 
 CRAWLING = pytest.mark.xfail(
     strict=True,
-    reason="at 1 m/s a car of 4.5 m covers a place for 4 s: met by 5 scans, looked through by the 2 after it has "
-    "gone, and 2 * 2 < 5: persistent() does not ask that the last scans meet it; 648 points confirmed, 0 at 1.25 m/s",
+    reason="at 1 m/s a car of 4.5 m covers a place for 4 s and is met there by 5 scans; where the visit ends before it "
+    "is looked through again it cannot be told from a car that stopped (0 points from 1.25 m/s)",
 )
 
 

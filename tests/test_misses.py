@@ -33,7 +33,7 @@ def crate(xy=(0.5, 4.0), visits=(1,), kind="crate", **more):
 LOW_AND_FAR = pytest.mark.xfail(
     strict=True,
     reason="of 45 voxels the ground takes 19, and 11 of the 26 others are not confirmed (a beam through the lower half "
-    "ends on the ground less than 0.3 m behind): 15 are fewer than min_points, 20",
+    "ends on the ground less than 0.3 m behind): 15 are fewer than min_points, 25",
 )
 
 
@@ -77,11 +77,6 @@ def test_a_large_van_of_which_one_side_is_seen_is_one_change(visits, polarity):
     compare(yard().plus(parked)).expect(**{polarity: {"parked": MOST}})
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="what is seen through the panes (the roof from below, the far side) lies 0.45 to 1.35 m from the skin and "
-    "becomes an object of its own (35 points in the sedan, 465 confirmed in the van): clusters end at gaps of 0.4 m",
-)
 @pytest.mark.parametrize("model,visits,polarity", [("sedan", (1,), "appeared"), ("van", (0,), "disappeared")])
 def test_a_car_with_panes_is_one_change(visits, polarity, model):
     parked = Thing("parked", car(rng(5), model).shut.moved((0.3, 4.2, 0), yaw=0.05), visits)
@@ -118,8 +113,7 @@ def test_a_box_beside_the_path_is_found(y_m):
 
 LEAVES = pytest.mark.xfail(
     strict=True,
-    reason="found twice over: leaves that their own visit looks through part it in two clusters of 46 and 590 sure "
-    "points (619 of 1119 confirmed voxels persist), each completed by the other's points to 775 and 954",
+    reason="0.71 of its surface: leaves that their own visit looks through do not count as having stayed",
 )
 
 
@@ -183,11 +177,6 @@ def test_a_change_at_the_edge_of_what_is_compared_is_found(visits, polarity):
     compare(open_field().plus(far_wall, parked)).expect(**{polarity: {"parked": MOST}})
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="persistent() counts looks from before it came: met by 6 scans, looked through by the 4 before, and "
-    "4 * 2 < 6 is false; 17 of 392 confirmed voxels are left",
-)
 def test_a_thing_put_down_in_the_middle_of_a_visit_is_found():
     compare(yard().plus(crate(since=0.4)), second=Visit(n_scans=10, every_s=0.6)).expect(appeared={"crate": MOST})
 

@@ -16,7 +16,7 @@ from .clusters import cluster, thin
 from .ground import Ground, is_ground_like, segment_ground
 from .occlusion import latest_sight, persistent, scans_looking_through
 from .results import DetectedObject, Detection, Thresholds
-from .submap import Submap
+from .submap import NO_SCANS, Submap, join
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
 COMPLETE_M = 1.5  # ... and by looked-through points of any distance, so far around them,
@@ -32,29 +32,29 @@ Around = Callable[[np.ndarray, np.ndarray], Submap]  # lower and upper corner (3
 
 
 @dataclass(frozen=True, eq=False)
-class _Side:
-    """One side of the comparison: its submap without ground, the ground, and all its scans' points in a box."""
+class Side:
+    """One side of the comparison: its submap without ground, the ground, and what more scans of it saw in a box."""
 
     standing: Submap
     ground: Ground
-    around: Around
+    more: Around
 
 
-def detect(
-    cumulative: Submap, recent: Submap, thresholds: Thresholds, more_cumulative: Around, more_recent: Around
-) -> Detection:
-    """Changes of the recent submap against the cumulative one: what appeared and what disappeared.
+def side_of(submap: Submap, thresholds: Thresholds, more: Around | None = None) -> Side:
+    """A submap as the detector wants it. more: its side's other scans, ground too, by which objects are completed."""
+    t = thresholds
+    centre = np.mean([-image.T_sensor_map[:3, :3].T @ image.T_sensor_map[:3, 3] for image in submap.images], axis=0)
+    is_ground, ground = segment_ground(submap.points, centre[:2], t.ground_sigmas, t.ground_min_sigma_m)
+    return Side(submap.only(~is_ground), ground, more or (lambda lower, upper: NO_SCANS))
 
-    more_...: the points in a box of all scans of the side, by which an object that was found is completed.
-    """
+
+def detect(before: Side, now: Side, thresholds: Thresholds) -> Detection:
+    """Changes of the later side against the earlier: what appeared and what disappeared."""
     t, watch = thresholds, Stopwatch()
+    new, old = now.standing.points, before.standing.points
     with ThreadPoolExecutor(2, thread_name_prefix="detect") as pool:  # the compiled loops run without the lock
-        (standing_c, ground_c), (standing_r, ground_r) = pool.map(without_ground, (cumulative, recent), (t, t))
-        watch.lap("ground")
-        new, old = standing_r.points, standing_c.points
         is_new, is_old = pool.map(changed, (new, old), (old, new), (t.tau_m,) * 2, (t.n,) * 2)
-        watch.lap("neighbours")
-    before, now = _Side(standing_c, ground_c, more_cumulative), _Side(standing_r, ground_r, more_recent)
+    watch.lap("neighbours")
     appeared = _one_way("appeared", now, is_new, before, t, watch)
     disappeared = _one_way("disappeared", before, is_old, now, t, watch)
     left = _counterparts(appeared.objects, disappeared.objects, "disappeared", before, now, t)
@@ -68,15 +68,8 @@ def detect(
     )
 
 
-def without_ground(submap: Submap, t: Thresholds) -> tuple[Submap, Ground]:
-    """A submap's points that are not ground, and the ground."""
-    centre = np.mean([-image.T_sensor_map[:3, :3].T @ image.T_sensor_map[:3, 3] for image in submap.images], axis=0)
-    is_ground, ground = segment_ground(submap.points, centre[:2], t.ground_sigmas, t.ground_min_sigma_m)
-    return submap.only(~is_ground), ground
-
-
 def _one_way(
-    polarity: str, side: _Side, is_far: np.ndarray, other: _Side, t: Thresholds, watch: Stopwatch
+    polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thresholds, watch: Stopwatch
 ) -> Detection:
     """Objects among the points of one side that are far from the other's, which could have seen them and did not."""
     this = side.standing.only(is_far)
@@ -164,7 +157,7 @@ def _evidence(
     return confirmed, possible, in_vain & possible
 
 
-def _completion(sure: np.ndarray, in_vain: np.ndarray, side: _Side, other: _Side, t: Thresholds) -> np.ndarray:
+def _completion(sure: np.ndarray, in_vain: np.ndarray, side: Side, other: Side, t: Thresholds) -> np.ndarray:
     """Points (M, 3) around an object's confirmed ones that its own distance, or the sky behind it, did not confirm.
 
     A door that closes a car, a bag against a wall: most of it lies within tau of what stays. Its own distance says
@@ -186,8 +179,8 @@ def _counterparts(
     found: list[DetectedObject],
     known: list[DetectedObject],
     polarity: str,
-    side: _Side,
-    other: _Side,
+    side: Side,
+    other: Side,
     t: Thresholds,
 ) -> list[DetectedObject]:
     """What left the place beside a thing that came, or came where one left, and is within tau of what stays there.
@@ -214,11 +207,12 @@ def _counterparts(
 
 
 def _looked_through_around(
-    points: np.ndarray, side: _Side, other: _Side, t: Thresholds, glimpses: bool
+    points: np.ndarray, side: Side, other: Side, t: Thresholds, glimpses: bool
 ) -> Submap:
     """What stands around some points, by all scans of a side, and was looked through by the other; one per voxel."""
     lower, upper = bounds(points)
-    near = side.around(lower - np.float32(COMPLETE_M), upper + np.float32(COMPLETE_M))
+    box = lower - np.float32(COMPLETE_M), upper + np.float32(COMPLETE_M)
+    near = join(side.standing.around(*box), side.more(*box))
     near = near.only(_first_of_voxels(near.points))
     for ground in (side.ground, other.ground):
         near = near.only(~ground.is_under(near.points, t.ground_sigmas, t.ground_min_sigma_m))

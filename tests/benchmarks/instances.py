@@ -72,7 +72,7 @@ def same_candidates(comparer: Comparer, job: Job) -> bool:
     """Whether both searches give the same points, both ways, of the submaps without their ground."""
     t = job.thresholds
     submaps = [comparer.load(selection, job.range_m)[0] for selection in (job.cumulative, job.recent)]
-    old, new = (detector.without_ground(submap, t)[0].points for submap in submaps)
+    old, new = (detector.side_of(submap, t).standing.points for submap in submaps)
     for a, b in ((new, old), (old, new)):
         far = candidates.changed(a, b, t.tau_m, t.n)
         dense = candidates.dense_enough(a[far], t.rho_m, t.n)

@@ -92,9 +92,10 @@ def equal_stride(descriptors: np.ndarray, visit: np.ndarray, k: int) -> np.ndarr
     return np.unique(np.linspace(0, len(visit) - 1, k).round().astype(int))
 
 
-def keep_ground(submap, thresholds):
-    """A submap whose ground is not looked for."""
-    return submap, ground._ground(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 3, 3), (0,))))
+def no_ground(points, *_):
+    """Labels of a segmentation that finds none."""
+    nothing = (np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 3, 3), (0,)))
+    return np.zeros(len(points), bool), ground._ground(*nothing)
 
 
 def everything_confirmed(this, other, t, glimpses):
@@ -156,7 +157,7 @@ TABLE_I = {
     "w/o OptMap": ((52.2, 79.7, 3.4, 1.0, 1.20, 31.9, 0), with_parts(select=equal_stride)),
     "w/o ground removal": (
         (62.2, 74.7, 2.6, 2.5, 1.61, 44.9, 0),
-        with_parts(without_ground=keep_ground, **NO_GROUND_FILTER),
+        with_parts(segment_ground=no_ground, **NO_GROUND_FILTER),
     ),
     "w/o occlusion filter": ((93.9, 93.9, 130.4, 282.2, 2.08, 57.5, 0), with_parts(**NO_OCCLUSION)),
     "w/o noise filter": (
