@@ -1,6 +1,6 @@
 """The experiments of the paper (CDSD section V) on virtual patrols, its tables beside the paper's own numbers.
 
-    python tests/benchmarks/paper.py --work /tmp/patrols [--seeds 1 2 3 4 5] [--tables 1 2 3 4]
+    python tests/benchmarks/paper.py --work /tmp/patrols [--seeds 1 2 3 4 5 | --folders F ...] [--tables 1 2 3 4]
 
 A Short Patrol (4 changes; the closed door that an opened one leaves is counted too) and a Long Patrol (18 changes,
 three passes, the last against the direction of the first) for each seed, odd seeds with an OS1-128 (RNG15), even ones
@@ -344,10 +344,14 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--scenarios", nargs="+", default=["short", "long"])
+    parser.add_argument("--folders", type=Path, nargs="+", help="patrols left by patrols.py, in place of seeds")
     parser.add_argument("--tables", type=int, nargs="+", default=[1, 2, 3, 4])
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    patrols = [patrol(arguments.work, name, seed) for name in arguments.scenarios for seed in arguments.seeds]
+    if arguments.folders:
+        patrols = [Patrol(f.name, f / "data", f / "truth", arguments.work) for f in arguments.folders]
+    else:
+        patrols = [patrol(arguments.work, name, seed) for name in arguments.scenarios for seed in arguments.seeds]
     tau, alpha = [], []
     for table in arguments.tables:
         print(f"\nTable {('I', 'II', 'III', 'IV')[table - 1]}, patrols: " + ", ".join(p.name for p in patrols))
