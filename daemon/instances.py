@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from .comparison import Comparison, Job, Selection
 from .config import Config
 from .detection.results import DetectedObject, Thresholds
 from .detection_process import ComparisonFailed, DetectionProcess
+from .moments import in_order
 from .submaps import select
 from .worker import Instance
 
@@ -83,9 +85,9 @@ class ChangeDetection:
         k = max(MIN_SCANS, round(self._config.submaps.k * self._config.scenes.alpha_m2 / REFERENCE_ALPHA_M2))
         chosen = np.zeros(len(usable.scan_id), dtype=bool)
         chosen[select(usable.descriptors, usable.visit_number, k)] = True
-        return Selection(
-            usable.session, usable.scan_id, usable.visit_number, usable.T_map_sensor[:, :3, 3], chosen
-        )
+        moment = in_order(usable.session, usable.stamp_ns)
+        position_m = usable.T_map_sensor[:, :3, 3]
+        return Selection(usable.session, usable.scan_id, usable.visit_number, moment, position_m, chosen)
 
     def job(self, instance: Instance) -> Job:
         """What is to be compared. Raises Rejected where a submap would say too little."""
@@ -108,19 +110,20 @@ class ChangeDetection:
 
     def _record(self, comparison: Comparison, instance: Instance) -> int:
         """Hand the objects to the change manager; how many of them are new."""
-        n_new = 0
+        n_new, before, after = 0, comparison.cumulative, comparison.recent
         for found in comparison.detection.objects:
             finding = Finding(
                 instance.map_id,
                 instance.session_id,
                 instance.scene_id,
                 instance.visit,
-                comparison.recent.host_ns[found.after_ns],
-                comparison.cumulative.session[found.before_ns],
-                comparison.recent.residual_m,
+                after.host_ns[found.after_ns],
+                before.session[found.before_ns],
+                after.residual_m,
                 self._model_id,
                 self._config.digest,
             )
+            found = replace(found, before_ns=before.stamp_ns[found.before_ns], after_ns=after.stamp_ns[found.after_ns])
             n_new += self._manager.record(found, finding)
             _log(found, instance)
         where = {"session": instance.session_id, "scene": instance.scene_id, "visit": instance.visit}

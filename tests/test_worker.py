@@ -68,7 +68,7 @@ def process(tmp_path):
 
 
 def job():
-    scans = Selection(np.array([1]), np.array([7]), np.array([1]), np.zeros((1, 3)), np.array([True]))
+    scans = Selection(*np.array([[1], [7], [1], [0]]), np.zeros((1, 3)), np.array([True]))
     return Job(scans, scans, [], [], 25.0, Thresholds(**Config().detection.model_dump()))
 
 
