@@ -12,12 +12,10 @@ from .hull import grown_area_m2
 from .keyscans import KeyScanRule
 from .localization import Localizer
 from .odometry import Odometry
+from .references import reference_points
 from .scenes import Scene, SceneTracker, SceneUpdate
 from .sensors import Sensors
-from .views import map_points
 from .worker import Instance
-
-REFERENCE_SCANS = 10  # of a scene's first visit, evenly spread: enough surface to register to
 
 
 class Session:
@@ -71,10 +69,5 @@ class Session:
 
     def _load_reference(self, scene: Scene) -> np.ndarray:
         """Points (N, 3) float32 of the scene's first visit, map frame."""
-        first = self._store.index.scans_of_scene(scene.scene_id, visit=1)
-        chosen = np.unique(np.linspace(0, len(first.scan_id) - 1, REFERENCE_SCANS).round().astype(int))
-        scans = [self._store.scans.read(int(first.session[i]), int(first.scan_id[i])) for i in chosen]
-        range_m = self._config.alignment.range_m
-        # Ten scans fill the registration's voxels many times over: half of their columns are enough.
-        clouds = [map_points(scan, self._sensors.get(scan.sensor_digest), range_m, every=2) for scan in scans]
-        return np.concatenate(clouds)
+        first_visit = self._store.index.scans_of_scene(scene.scene_id, visit=1)
+        return reference_points(first_visit, self._store.scans, self._sensors, self._config.alignment.range_m)
