@@ -14,7 +14,7 @@ from .changes import ChangeManager, Finding
 from .comparison import Comparison, Job, Selection
 from .config import Config
 from .detection.results import DetectedObject, Thresholds
-from .detection_process import ComparisonFailed, DetectionProcess
+from .detection_process import DetectionProcess, JobFailed
 from .moments import in_order
 from .submaps import select
 from .worker import Instance
@@ -32,12 +32,12 @@ class Rejected(Exception):
 class ChangeDetection:
     """Runs instances on stored scans; called by the detection thread alone."""
 
-    def __init__(self, config: Config, store: Store, model_id: str):
+    def __init__(self, config: Config, store: Store, process: DetectionProcess, model_id: str):
         self._config = config
         self._store = store
         self._model_id = model_id
         self._manager = ChangeManager(store.changes)
-        self._process = DetectionProcess(store.dir.path)
+        self._process = process
         self._thresholds = Thresholds(**config.detection.model_dump())
         self.n_changes = 0  # change objects new in this run
 
@@ -48,7 +48,7 @@ class ChangeDetection:
         try:
             job = self.job(instance)
             comparison = self._process.compare(job)
-        except (Rejected, ComparisonFailed) as why:
+        except (Rejected, JobFailed) as why:
             status = "rejected" if isinstance(why, Rejected) else "failed"
             logger.info("instance %s scene=%d visit=%d: %s", status, instance.scene_id, instance.visit, why)
             index.record_instance(InstanceRow(**row, status=status, reason=str(why)))
@@ -69,10 +69,6 @@ class ChangeDetection:
                 alignment_residual_m=comparison.recent.residual_m,
             )
         )
-
-    def close(self) -> None:
-        """End the process that compares."""
-        self._process.close()
 
     def _choose(self, scans: SceneScans) -> Selection:
         """Of the scans whose poses can be trusted in this scene, those that represent the visits best (OptMap)."""

@@ -10,7 +10,7 @@ import pytest
 from revisitd.daemon.comparison import Job, Selection
 from revisitd.daemon.config import Config
 from revisitd.daemon.detection.results import Thresholds
-from revisitd.daemon.detection_process import ComparisonFailed, DetectionProcess
+from revisitd.daemon.detection_process import DetectionProcess, JobFailed
 from revisitd.daemon.worker import DetectionWorker, Instance
 from revisitd.storage.store import Store
 
@@ -73,13 +73,13 @@ def job():
 
 
 def test_a_scan_that_is_gone_fails_the_comparison_and_is_named(process):
-    with pytest.raises(ComparisonFailed, match="ScanFileError: .*7.scan"):
+    with pytest.raises(JobFailed, match="ScanFileError: .*7.scan"):
         process.compare(job())
 
 
 def test_a_killed_detection_process_fails_one_comparison_and_is_replaced(process):
     os.kill(process._process.pid, signal.SIGKILL)
-    with pytest.raises(ComparisonFailed, match="died .exit code -9."):
+    with pytest.raises(JobFailed, match="died .exit code -9."):
         process.compare(job())
-    with pytest.raises(ComparisonFailed, match="ScanFileError"):
+    with pytest.raises(JobFailed, match="ScanFileError"):
         process.compare(job())
