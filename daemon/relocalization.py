@@ -96,6 +96,8 @@ class Relocator:
     def _places_like(self, descriptor: np.ndarray, model_id: str, maps: list[int]) -> list[Place]:
         """The scenes of these maps whose scans lie nearest by descriptor."""
         scenes, scene_maps, descriptors = self._store.index.scene_descriptors(model_id, maps)
+        if len(scenes) == 0:  # described by another model
+            return []
         order = np.argsort(-(descriptors @ descriptor), kind="stable")
         _, first = np.unique(scenes[order], return_index=True)
         nearest = order[np.sort(first)[:SCENES]]
@@ -104,9 +106,7 @@ class Relocator:
     def _load_place(self, map_id: int, scene_id: int) -> Place:
         first_visit = self._store.index.scans_of_scene(scene_id, visit=1)
         points = self._points(first_visit, PLAN_SCANS)
-        return Place(
-            map_id, scene_id, PlacePlan(points, first_visit.T_map_sensor), surface_of(points, COARSE_VOXEL_M)
-        )
+        return Place(map_id, scene_id, PlacePlan(points, first_visit.T_map_sensor), surface_of(points, COARSE_VOXEL_M))
 
     def _load_surface(self, scene_id: int) -> Surface:
         first_visit = self._store.index.scans_of_scene(scene_id, visit=1)
@@ -172,6 +172,4 @@ def verdict(map_id: int, matches: list[Match], max_residual_m: float) -> Answer:
 def same_pose(T_a: np.ndarray, T_b: np.ndarray, within_m: float, within_deg: float) -> bool:
     """Whether two poses (4, 4) differ by less than both limits."""
     between = inverse(T_a) @ T_b
-    return bool(
-        np.linalg.norm(between[:3, 3]) < within_m and np.degrees(rotation_angle_rad(between)) < within_deg
-    )
+    return bool(np.linalg.norm(between[:3, 3]) < within_m and np.degrees(rotation_angle_rad(between)) < within_deg)

@@ -99,4 +99,3 @@ def _paced(frames: Source, rate: float | None):
             due = first[0] + (frame.stamp_ns - first[1]) * 1e-9 / rate
             time.sleep(max(0.0, due - time.monotonic()))
         yield frame
-
