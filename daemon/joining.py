@@ -32,7 +32,7 @@ class Join:
 
 
 class Joiner:
-    """Watches the key scans of one session. maps: the earlier ones, the preferred one first; without any it is idle.
+    """Watches the key scans of one session. maps: the earlier ones, the preferred one first.
 
     locate: answers a question some time later, elsewhere. wait: for each answer (replay: the same result each time),
     or look for it at each key scan (a live robot).
@@ -44,16 +44,14 @@ class Joiner:
         self._due_m = 0.0  # travel until the next question
         self._asked: tuple[Future[Answer], np.ndarray] | None = None  # and T_odom_sensor of the scan asked about
         self._known: Join | None = None  # by one answer: not yet believed
-        self.attempts = 0
 
     def update(self, scan: Scan) -> Join | None:
         """Take the next key scan; the join when a second answer has confirmed the first."""
         self._travel(scan.T_odom_sensor[:3, 3])
-        if self._maps and self._asked is None and self._due_m <= 0.0:
+        if self._asked is None and self._due_m <= 0.0:
             question = Question(scan.session, scan.scan_id, self._maps, self._alignment)
             self._asked = self._locate(question), scan.T_odom_sensor
             self._due_m = EVERY_M
-            self.attempts += 1
         if self._asked is None or not (self._wait or self._asked[0].done()):
             return None
         (future, T_odom_sensor), self._asked = self._asked, None

@@ -9,6 +9,7 @@ What happens to an instance (submaps, detection, change objects) is in instances
 from __future__ import annotations
 
 import logging
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from ..drivers.frame import Frame
@@ -22,6 +23,7 @@ from .joining import Join, Joiner, Locate
 from .localization import Fix
 from .memory import return_freed
 from .odometry import Motion
+from .relocalization import Answer, Question
 from .scenes import SceneUpdate
 from .sensors import Sensors
 from .session import Session
@@ -115,8 +117,9 @@ class Pipeline:
         self._note(
             session, session.scenes.update(scan.scan_id, scan.stamp_ns, fix.T_map_sensor[:2, 3], scan.descriptor)
         )
-        if self._joiner is not None:
-            self._join(session, self._joiner.update(scan))
+        join = self._joiner.update(scan) if self._joiner is not None else None
+        if join is not None:
+            self._go_on_in(join, session)
 
     def _scan(self, session: Session, frame: Frame, motion: Motion, fix: Fix) -> Scan:
         sensor = frame.sensor
@@ -151,16 +154,17 @@ class Pipeline:
 
     def _start_session(self, frame: Frame) -> Session:
         maps = self._store.index.maps_to_join()
-        self._joiner = Joiner(self._locate, maps, self._config.alignment, self._wait) if maps else None
+        self._joiner = Joiner(self._ask_where, maps, self._config.alignment, self._wait) if maps else None
         self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source)
         logger.info("session %d starts sensor=%s", self._session.session_id, frame.sensor.serial)
         return self._session
 
-    def _join(self, session: Session, join: Join | None) -> None:
-        """Where the session's place in an earlier map is known: end its own map, and go on in that one."""
-        self.counts.join_attempts = self._joiner.attempts
-        if join is None:
-            return
+    def _ask_where(self, question: Question) -> Future[Answer]:
+        self.counts.join_attempts += 1
+        return self._locate(question)
+
+    def _go_on_in(self, join: Join, session: Session) -> None:
+        """The session's place in an earlier map is known: end its own map, and go on in that one without a break."""
         self.finish()
         self._joiner, self._session = None, session.joined(join)
         self.counts.joined_maps.append(join.map_id)
