@@ -106,7 +106,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("patrols", type=Path, nargs="+")
     parser.add_argument("--step", type=int, default=4, help="every so many-th key scan is a start")
-    parser.add_argument("--no-others", action="store_true", help="look in each patrol's own map only")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         data = {folder: copied(folder, Path(scratch)) for folder in arguments.patrols}
@@ -125,7 +124,7 @@ def main() -> None:
                 f"median {np.median(degrees):.2f} max {degrees.max():.2f} deg"
             )
             world = folder.name.split("_")[0]
-            others = [] if arguments.no_others else [f for f in pairs if f.name.split("_")[0] != world]
+            others = [other for other in pairs if other.name.split("_")[0] != world]
             strangers = [attempts(relocator, pairs[other][::3]) for other in others]
             n = sum(len(answered) for answered, _ in strangers)
             false = sum(not answer.reason for answered, _ in strangers for _, answer in answered)
