@@ -48,7 +48,8 @@ class ChangeManager:
         sure, evidence = confidence(found), _evidence(found)
         same = [(c, share) for c, share in touching if c.polarity == found.polarity and c.state == "present"]
         # Of the same interval: another view of the same moment. However little of the two touches, they are one.
-        views = [c for c, _ in same if c.session == finding.session and found.before_ns < c.first_seen_ns]
+        old = finding.before_session, found.before_ns
+        views = [c for c, _ in same if c.session == finding.session and old < (c.session, c.first_seen_ns)]
         if views:
             views.sort(key=lambda change: -change.n_points)
             known, parts = views[0], views[1:]
@@ -64,7 +65,7 @@ class ChangeManager:
         change_id = self._store.add(_change(found, finding, sure, evidence))
         for other, share in touching:
             # Only what was there before: a door that opens disappears here and appears beside in one interval.
-            older = (other.session, other.first_seen_ns) <= (finding.before_session, found.before_ns)
+            older = (other.session, other.first_seen_ns) <= old
             if older and share >= MIN_TOUCH_SHARE:
                 self._observe(other, "gone", found, finding, superseded_by=change_id)
         return True

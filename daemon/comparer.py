@@ -7,6 +7,7 @@ compiles its loops, takes 60 MB: only that process imports this module.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from .comparison import Comparison, Job, ScanFacts, Selection
 from .detection.detector import Side, detect, side_of
 from .detection.erasure import update_map
 from .detection.occlusion import state_of
+from .detection.results import Erasure
 from .detection.submap import Submap
 from .sensors import Sensors
 from .stopwatch import Stopwatch
@@ -51,7 +53,7 @@ class Comparer:
         """One side of the comparison; how many points it has with its ground, which are not kept."""
         submap, facts = self.load(selection, job.range_m)
         watch.lap("load")
-        submap = update_map(submap, selection.session[selection.chosen], job.erasures)
+        submap = _updated(submap, selection.only(selection.chosen), job.erasures)
         watch.lap("update_map")
         side = side_of(submap, job.thresholds, _More(self, selection, facts, job).around)
         watch.lap("ground")
@@ -61,7 +63,7 @@ class Comparer:
         """The submap of a selection's chosen scans."""
         chosen = selection.only(selection.chosen)
         submap, scans = build_submap(lambda i: self.read(chosen, i), chosen.visit, range_m)
-        return submap, _facts(scans)
+        return submap, _facts(scans, chosen.moment)
 
     def read(self, selection: Selection, i: int) -> tuple[Scan, Sensor]:
         """One scan of a selection and its sensor."""
@@ -89,17 +91,25 @@ class _More:
         submap, scans = build_submap(
             lambda i: self._comparer.read(selection, i), selection.visit, self._job.range_m
         )
-        facts = _facts(scans)
+        facts = _facts(scans, selection.moment)
         self._facts.session.update(facts.session)
+        self._facts.stamp_ns.update(facts.stamp_ns)
         self._facts.host_ns.update(facts.host_ns)
-        return update_map(submap, selection.session, self._job.erasures)
+        return _updated(submap, selection, self._job.erasures)
 
 
-def _facts(scans: list[Scan]) -> ScanFacts:
+def _updated(submap: Submap, selection: Selection, erasures: list[Erasure]) -> Submap:
+    """The submap of a selection's scans without what is known to be gone, its times in order over all sessions."""
+    return replace(update_map(submap, selection.session, erasures), stamp_ns=selection.moment)
+
+
+def _facts(scans: list[Scan], moment: np.ndarray) -> ScanFacts:
     residuals = np.array([scan.alignment_residual_m for scan in scans])
     known = residuals[np.isfinite(residuals)]
+    by_moment = dict(zip(moment.tolist(), scans, strict=True))
     return ScanFacts(
-        {scan.stamp_ns: scan.session for scan in scans},
-        {scan.stamp_ns: scan.host_ns for scan in scans},
+        {at: scan.session for at, scan in by_moment.items()},
+        {at: scan.stamp_ns for at, scan in by_moment.items()},
+        {at: scan.host_ns for at, scan in by_moment.items()},
         float(known.mean()) if len(known) else float("nan"),
     )

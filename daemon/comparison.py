@@ -13,20 +13,20 @@ from .detection.results import Detection, Erasure, KnownChange, KnownState, Thre
 class Selection:
     """The scans of one side that may be used, and which of them represent it.
 
-    session (S,), scan_id (S,) and visit (S,) int64; position_m (S, 3) map frame; chosen (S,) bool: the submap's.
+    session (S,), scan_id (S,), visit (S,) and moment (S,) int64, times in order over all sessions (moments.py);
+    position_m (S, 3) map frame; chosen (S,) bool: the submap's.
     """
 
     session: np.ndarray
     scan_id: np.ndarray
     visit: np.ndarray
+    moment: np.ndarray
     position_m: np.ndarray
     chosen: np.ndarray
 
     def only(self, keep: np.ndarray) -> Selection:
         """Some of the scans, by indices or (S,) bool."""
-        return Selection(
-            self.session[keep], self.scan_id[keep], self.visit[keep], self.position_m[keep], self.chosen[keep]
-        )
+        return Selection(**{name: column[keep] for name, column in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,10 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class ScanFacts:
-    """What the record of a change needs of each scan of a submap, by its sensor time."""
+    """What the record of a change needs of each scan of a submap, by its moment."""
 
     session: dict[int, int]
+    stamp_ns: dict[int, int]  # the session's sensor time
     host_ns: dict[int, int]
     residual_m: float  # mean over the scans
 

@@ -1,4 +1,4 @@
-"""Runs comparisons in a child process, one at a time, and survives its death."""
+"""Runs what is heavy in a child process, one job at a time, and survives its death."""
 
 from __future__ import annotations
 
@@ -6,30 +6,48 @@ import logging
 import multiprocessing
 import os
 import signal
+import threading
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from .comparison import Comparison, Job
 from .memory import return_freed
+from .relocalization import Answer, Question, Relocator
 
 logger = logging.getLogger(__name__)
 
 NICENESS = 5  # the frame loop goes first on two cores
 
 
-class ComparisonFailed(Exception):
-    """The child could not compare, or died; the message says why."""
+class JobFailed(Exception):
+    """The child could not do its job, or died; the message says why."""
 
 
 class DetectionProcess:
-    """A child that compares. Used by one thread; started at once, so that its imports are done when a job comes."""
+    """A child that compares and locates. Started at once, so that its imports are done when a job comes.
+
+    Thread rule: any thread may call compare and locate; each waits until the child is free.
+    """
 
     def __init__(self, data: Path):
         self._data = data
+        self._free = threading.Lock()
         self._start()
 
     def compare(self, job: Job) -> Comparison:
-        """Run a job and wait for it, without holding the interpreter's lock. Raises ComparisonFailed."""
+        """Run a comparison and wait for it, without holding the interpreter's lock. Raises JobFailed."""
+        return self._run(job)
+
+    def locate(self, question: Question) -> Answer:
+        """Look for a key scan in the earlier maps, and wait for it likewise. Raises JobFailed."""
+        return self._run(question)
+
+    def _run(self, job: Job | Question) -> Any:
+        with self._free:
+            return self._run_alone(job)
+
+    def _run_alone(self, job: Job | Question) -> Any:
         try:
             self._connection.send(job)
             result = self._connection.recv()
@@ -37,9 +55,9 @@ class DetectionProcess:
             self._process.join(1.0)
             code = self._process.exitcode
             self._start()
-            raise ComparisonFailed(f"the detection process died (exit code {code}); another was started") from error
+            raise JobFailed(f"the detection process died (exit code {code}); another was started") from error
         if isinstance(result, Exception):
-            raise ComparisonFailed(f"{type(result).__name__}: {result}") from result
+            raise JobFailed(f"{type(result).__name__}: {result}") from result
         return result
 
     def close(self) -> None:
@@ -69,14 +87,19 @@ def _serve(connection: Connection, data: Path) -> None:
     from .comparer import Comparer
 
     comparer: Comparer | None = None
+    relocator: Relocator | None = None
     while True:
         try:
             job = connection.recv()
         except EOFError:
             return
         try:
-            comparer = comparer or Comparer(data)
-            answer = comparer.compare(job)
+            if isinstance(job, Question):
+                relocator = relocator or Relocator(data, job.alignment)
+                answer = relocator.locate(job)
+            else:
+                comparer = comparer or Comparer(data)
+                answer = comparer.compare(job)
         except Exception as error:  # whatever went wrong is the parent's to judge
             answer = error
         connection.send(answer)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from .changes import ChangeManager, Finding
 from .comparison import Comparison, Job, Selection
 from .config import Config
 from .detection.results import DetectedObject, Thresholds
-from .detection_process import ComparisonFailed, DetectionProcess
+from .detection_process import DetectionProcess, JobFailed
+from .moments import in_order
 from .submaps import select
 from .worker import Instance
 
@@ -30,12 +32,12 @@ class Rejected(Exception):
 class ChangeDetection:
     """Runs instances on stored scans; called by the detection thread alone."""
 
-    def __init__(self, config: Config, store: Store, model_id: str):
+    def __init__(self, config: Config, store: Store, process: DetectionProcess, model_id: str):
         self._config = config
         self._store = store
         self._model_id = model_id
         self._manager = ChangeManager(store.changes)
-        self._process = DetectionProcess(store.dir.path)
+        self._process = process
         self._thresholds = Thresholds(**config.detection.model_dump())
         self.n_changes = 0  # change objects new in this run
 
@@ -46,7 +48,7 @@ class ChangeDetection:
         try:
             job = self.job(instance)
             comparison = self._process.compare(job)
-        except (Rejected, ComparisonFailed) as why:
+        except (Rejected, JobFailed) as why:
             status = "rejected" if isinstance(why, Rejected) else "failed"
             logger.info("instance %s scene=%d visit=%d: %s", status, instance.scene_id, instance.visit, why)
             index.record_instance(InstanceRow(**row, status=status, reason=str(why)))
@@ -68,10 +70,6 @@ class ChangeDetection:
             )
         )
 
-    def close(self) -> None:
-        """End the process that compares."""
-        self._process.close()
-
     def _choose(self, scans: SceneScans) -> Selection:
         """Of the scans whose poses can be trusted in this scene, those that represent the visits best (OptMap)."""
         usable = scans.only(((scans.visit_number == 1) | scans.aligned) & (scans.model_id == self._model_id))
@@ -83,9 +81,9 @@ class ChangeDetection:
         k = max(MIN_SCANS, round(self._config.submaps.k * self._config.scenes.alpha_m2 / REFERENCE_ALPHA_M2))
         chosen = np.zeros(len(usable.scan_id), dtype=bool)
         chosen[select(usable.descriptors, usable.visit_number, k)] = True
-        return Selection(
-            usable.session, usable.scan_id, usable.visit_number, usable.T_map_sensor[:, :3, 3], chosen
-        )
+        moment = in_order(usable.session, usable.stamp_ns)
+        position_m = usable.T_map_sensor[:, :3, 3]
+        return Selection(usable.session, usable.scan_id, usable.visit_number, moment, position_m, chosen)
 
     def job(self, instance: Instance) -> Job:
         """What is to be compared. Raises Rejected where a submap would say too little."""
@@ -108,19 +106,20 @@ class ChangeDetection:
 
     def _record(self, comparison: Comparison, instance: Instance) -> int:
         """Hand the objects to the change manager; how many of them are new."""
-        n_new = 0
+        n_new, before, after = 0, comparison.cumulative, comparison.recent
         for found in comparison.detection.objects:
             finding = Finding(
                 instance.map_id,
                 instance.session_id,
                 instance.scene_id,
                 instance.visit,
-                comparison.recent.host_ns[found.after_ns],
-                comparison.cumulative.session[found.before_ns],
-                comparison.recent.residual_m,
+                after.host_ns[found.after_ns],
+                before.session[found.before_ns],
+                after.residual_m,
                 self._model_id,
                 self._config.digest,
             )
+            found = replace(found, before_ns=before.stamp_ns[found.before_ns], after_ns=after.stamp_ns[found.after_ns])
             n_new += self._manager.record(found, finding)
             _log(found, instance)
         where = {"session": instance.session_id, "scene": instance.scene_id, "visit": instance.visit}

@@ -10,13 +10,13 @@ import numpy as np
 import small_gicp
 
 from .config import AlignmentConfig
-from .geometry import inverse, rotation_angle_rad, transform
+from .geometry import inverse, rotation_angle_rad
 from .local_map import LocalMap
+from .registration import Match, Surface, align, judge, scan_cloud, surface_of
 from .scenes import Scene
 
 CACHED_REFERENCES = 3  # scenes overlap at their rims; more than that are never in play at once
 MAX_TURN_DEG = 8.0  # a correction that turns the map further is a wrong match, not drift
-SCAN_VOXEL_RATIO = 1.6  # a scan is thinner than the reference it is registered to
 MAX_SEAM_M = 0.1  # a fix that moves the map further leaves the last key scans where they are no longer true
 MIN_COARSE_TRAVEL_M = 5.0  # metres without a fix after which a large drift is looked for at once
 
@@ -31,13 +31,6 @@ class Fix:
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class _Match:
-    T_map_sensor: np.ndarray
-    inlier_ratio: float
-    residual_m: float
-
-
 class Localizer:
     """Keeps T_map_odom up to date.
 
@@ -47,7 +40,7 @@ class Localizer:
     def __init__(self, config: AlignmentConfig, load_reference: Callable[[Scene], np.ndarray], T_map_odom: np.ndarray):
         self._config = config
         self._load_reference = load_reference
-        self._references: OrderedDict[int, tuple[small_gicp.PointCloud, small_gicp.KdTree]] = OrderedDict()
+        self._references: OrderedDict[int, Surface] = OrderedDict()
         self._local_map = LocalMap(config.local_voxel_m, config.local_scans)
         self._last_position: np.ndarray | None = None
         self._travel_since_fix_m = 0.0
@@ -68,8 +61,7 @@ class Localizer:
         scenes: the known scenes that the robot may be in, nearest first; without one the prediction stands.
         """
         self._travel(T_odom_sensor)
-        near = points[(points**2).sum(axis=1) < self._config.range_m**2].astype(np.float64)
-        source, _ = small_gicp.preprocess_points(near, self._config.voxel_m * SCAN_VOXEL_RATIO, 10, 1)
+        source = scan_cloud(points, self._config.voxel_m, self._config.range_m)
         fix = self._fix(source, self.predict(T_odom_sensor), scenes)
         self._local_map.add(source, fix.T_map_sensor)
         self.T_map_odom = fix.T_map_sensor @ inverse(T_odom_sensor)
@@ -98,29 +90,14 @@ class Localizer:
 
     def _register(
         self, source: small_gicp.PointCloud, predicted: np.ndarray, scene: Scene, coarse: bool
-    ) -> _Match:
+    ) -> Match:
         gates = [self._config.coarse_gate_m, self._config.gate_m] if coarse else [self._config.gate_m]
-        T = predicted
-        target, tree = self._reference(scene)
+        T, surface = predicted, self._reference(scene)
         for gate in gates:
-            T = small_gicp.align(
-                target, source, tree, T, registration_type="GICP", max_correspondence_distance=gate, num_threads=1
-            ).T_target_source
-        return self._judge(T, source, target, tree)
+            T = align(source, surface, T, gate)
+        return judge(T, source, surface, self._config.gate_m)
 
-    def _judge(
-        self, T: np.ndarray, source: small_gicp.PointCloud, target: small_gicp.PointCloud, tree: small_gicp.KdTree
-    ) -> _Match:
-        in_map = transform(T, source.points()[:, :3])
-        index, squared = tree.batch_nearest_neighbor_search(in_map, num_threads=1)
-        paired = np.asarray(squared) < self._config.gate_m**2
-        if not paired.any():
-            return _Match(T, 0.0, float("inf"))
-        at = np.asarray(index)[paired]
-        off = ((in_map[paired] - target.points()[at, :3]) * target.normals()[at, :3]).sum(axis=1)
-        return _Match(T, float(paired.mean()), float(np.sqrt((off**2).mean())))
-
-    def _objection(self, match: _Match, predicted: np.ndarray) -> str:
+    def _objection(self, match: Match, predicted: np.ndarray) -> str:
         """Why a match is not believed; empty when it is."""
         correction = inverse(predicted) @ match.T_map_sensor
         moved = float(np.linalg.norm(correction[:3, 3]))
@@ -133,10 +110,9 @@ class Localizer:
             return f"correction of {moved:.1f} m and {turned:.0f} deg is not believed"
         return ""
 
-    def _reference(self, scene: Scene) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
+    def _reference(self, scene: Scene) -> Surface:
         if scene.scene_id not in self._references:
-            points = self._load_reference(scene).astype(np.float64)
-            self._references[scene.scene_id] = small_gicp.preprocess_points(points, self._config.voxel_m, 12, 1)
+            self._references[scene.scene_id] = surface_of(self._load_reference(scene), self._config.voxel_m)
             if len(self._references) > CACHED_REFERENCES:
                 self._references.popitem(last=False)
         self._references.move_to_end(scene.scene_id)

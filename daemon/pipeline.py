@@ -1,6 +1,7 @@
 """The life of one frame, top to bottom: from the sensor's packets to an instance of change detection.
 
     gate -> odometry -> key scan? -> localization -> descriptor -> scan file and index -> scenes -> instance
+                                                                                    -> join to an earlier map
 
 What happens to an instance (submaps, detection, change objects) is in instances.py, on the detection thread.
 """
@@ -8,7 +9,8 @@ What happens to an instance (submaps, detection, change objects) is in instances
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, field
 
 from ..drivers.frame import Frame
 from ..drivers.gate import FrameGate, Rejection
@@ -17,9 +19,11 @@ from ..storage.scans import Scan
 from ..storage.store import Store
 from .config import Config
 from .geometry import column_phase, deskew
+from .joining import Join, Joiner, Locate
 from .localization import Fix
 from .memory import return_freed
 from .odometry import Motion
+from .relocalization import Answer, Question
 from .scenes import SceneUpdate
 from .sensors import Sensors
 from .session import Session
@@ -41,6 +45,8 @@ class Counts:
     scenes: int = 0
     instances: int = 0
     odometry_lost: int = 0
+    joined_maps: list[int] = field(default_factory=list)  # one for each session that found its place in an earlier map
+    join_attempts: int = 0
 
 
 class Pipeline:
@@ -53,15 +59,17 @@ class Pipeline:
         sensors: Sensors,
         model: DescriptorModel,
         worker: DetectionWorker,
+        locate: Locate,
         source: str,
         wait: bool,
     ):
         self.counts = Counts()
         self.gate = FrameGate(config.gate.min_valid_ratio)
         self._config, self._store, self._sensors = config, store, sensors
-        self._model, self._worker = model, worker
+        self._model, self._worker, self._locate = model, worker, locate
         self._source, self._wait = source, wait
         self._session: Session | None = None
+        self._joiner: Joiner | None = None  # of a session in a map of its own
         self._clock_back = 0  # frames in a row whose time was not after the last accepted one
 
     def process(self, frame: Frame) -> None:
@@ -109,6 +117,9 @@ class Pipeline:
         self._note(
             session, session.scenes.update(scan.scan_id, scan.stamp_ns, fix.T_map_sensor[:2, 3], scan.descriptor)
         )
+        join = self._joiner.update(scan) if self._joiner is not None else None
+        if join is not None:
+            self._go_on_in(join, session)
 
     def _scan(self, session: Session, frame: Frame, motion: Motion, fix: Fix) -> Scan:
         sensor = frame.sensor
@@ -142,9 +153,22 @@ class Pipeline:
             return_freed()
 
     def _start_session(self, frame: Frame) -> Session:
+        maps = self._store.index.maps_to_join()
+        self._joiner = Joiner(self._ask_where, maps, self._config.alignment, self._wait) if maps else None
         self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source)
         logger.info("session %d starts sensor=%s", self._session.session_id, frame.sensor.serial)
         return self._session
+
+    def _ask_where(self, question: Question) -> Future[Answer]:
+        self.counts.join_attempts += 1
+        return self._locate(question)
+
+    def _go_on_in(self, join: Join, session: Session) -> None:
+        """The session's place in an earlier map is known: end its own map, and go on in that one without a break."""
+        self.finish()
+        self._joiner, self._session = None, session.joined(join)
+        self.counts.joined_maps.append(join.map_id)
+        logger.info("session %d continues %d in map %d", self._session.session_id, session.session_id, join.map_id)
 
     def _lose_session(self, motion: Motion) -> None:
         """Without odometry nothing may be compared across the break: close the session; the next frame starts one."""

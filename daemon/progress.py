@@ -57,7 +57,11 @@ def summary_text(summary: Summary) -> str:
         f"{summary.instances_failed} failed; {summary.changes} changes",
     ]
     if c.odometry_lost:
-        lines.append(f"odometry lost {c.odometry_lost} times: each began a session and a map of its own")
+        lines.append(f"odometry lost {c.odometry_lost} times: each began a new session")
+    if c.joined_maps:
+        lines.append("joined to earlier maps: " + ", ".join(f"map {map_id}" for map_id in c.joined_maps))
+    elif c.join_attempts:
+        lines.append(f"not joined to an earlier map ({c.join_attempts} attempts): this run made a map of its own")
     if summary.losses:
         lines.append("lost: " + ", ".join(f"{count} x {cause}" for cause, count in summary.losses.items()))
     return "\n".join(lines)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from ..drivers.ouster import Source, open_source
 from ..models.descriptor import DescriptorModel
 from ..storage.store import Store
 from .config import Config, dump_config
+from .detection_process import DetectionProcess
 from .instances import ChangeDetection
 from .pipeline import Counts, Pipeline
 from .sensors import Sensors
@@ -47,12 +49,21 @@ def replay(
     with open_source(source, meta) as frames, Store.open_writer(data) as store:
         (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
         model = DescriptorModel.load()
-        detection = ChangeDetection(config, store, model.model_id)
+        process = DetectionProcess(store.dir.path)
+        detection = ChangeDetection(config, store, process, model.model_id)
         worker = DetectionWorker(detection.run, config.worker.queue_size)
+        joining = ThreadPoolExecutor(1, thread_name_prefix="joining")
         try:
             recorded = frames.n_frames_estimate is not None  # a live sensor waits for nobody
             pipeline = Pipeline(
-                config, store, Sensors(store.dir), model, worker, source, wait=recorded and rate is None
+                config,
+                store,
+                Sensors(store.dir),
+                model,
+                worker,
+                lambda question: joining.submit(process.locate, question),
+                source,
+                wait=recorded and rate is None,
             )
             try:
                 for frame in _paced(frames, rate):
@@ -64,7 +75,8 @@ def replay(
             worker.drain()
         finally:
             worker.close()
-            detection.close()
+            joining.shutdown(cancel_futures=True)
+            process.close()
         progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
         pipeline.gate.require_accepted(source)
         return Summary(
@@ -87,4 +99,3 @@ def _paced(frames: Source, rate: float | None):
             due = first[0] + (frame.stamp_ns - first[1]) * 1e-9 / rate
             time.sleep(max(0.0, due - time.monotonic()))
         yield frame
-

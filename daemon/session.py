@@ -1,4 +1,4 @@
-"""One session: a run of the odometry without a break, and what it knows of the map."""
+"""One session: a run of the odometry without a break, in one map, and what it knows of the map."""
 
 from __future__ import annotations
 
@@ -9,24 +9,35 @@ from ..drivers.frame import Sensor
 from ..storage.store import Store
 from .config import Config, dump_config
 from .hull import grown_area_m2
+from .joining import Join
 from .keyscans import KeyScanRule
 from .localization import Localizer
 from .odometry import Odometry
+from .references import reference_points
 from .scenes import Scene, SceneTracker, SceneUpdate
 from .sensors import Sensors
-from .views import map_points
 from .worker import Instance
-
-REFERENCE_SCANS = 10  # of a scene's first visit, evenly spread: enough surface to register to
 
 
 class Session:
-    """The parts that begin anew when the odometry does."""
+    """The parts that begin anew when the odometry does, or when its place in an earlier map is found."""
 
-    def __init__(self, config: Config, store: Store, sensors: Sensors, sensor: Sensor, source: str):
+    def __init__(
+        self,
+        config: Config,
+        store: Store,
+        sensors: Sensors,
+        sensor: Sensor,
+        source: str,
+        join: Join | None = None,
+        continues: Session | None = None,
+    ):
+        """A session with a map of its own; with a join, the one that continues another in an earlier map."""
         self._config = config
         self._store = store
         self._sensors = sensors
+        self._sensor = sensor
+        self._source = source
         sensors.put(sensor)
         self.session_id = store.index.start_session(
             source=source,
@@ -38,12 +49,20 @@ class Session:
             clock_source="sensor",
             config=dump_config(config),
             software_version=__version__,
+            map_id=join.map_id if join else None,
+            continues=continues.session_id if continues else None,
         )
-        self.map_id = self.session_id
-        self.odometry = Odometry(config.odometry)
-        self.key_scans = KeyScanRule(config.keyscans)
-        self.localizer = Localizer(config.alignment, self._load_reference, np.eye(4))
-        self.scenes = SceneTracker(config.scenes, [], store.index.next_scene_id())
+        self.map_id = join.map_id if join else self.session_id
+        self.odometry = continues.odometry if continues else Odometry(config.odometry)
+        self.key_scans = continues.key_scans if continues else KeyScanRule(config.keyscans)
+        T_map_odom = join.T_map_odom if join else np.eye(4)
+        self.localizer = Localizer(config.alignment, self._load_reference, T_map_odom)
+        known = [Scene(row.scene_id, row.hull, row.n_visits) for row in store.index.scenes(self.map_id)]
+        self.scenes = SceneTracker(config.scenes, known, store.index.next_scene_id())
+
+    def joined(self, join: Join) -> Session:
+        """The session that goes on from this one, which has ended, in an earlier map: the same odometry, no break."""
+        return Session(self._config, self._store, self._sensors, self._sensor, self._source, join, self)
 
     def scenes_to_align_with(self, T_odom_sensor: np.ndarray) -> list[Scene]:
         """Known scenes that the robot may be in, nearest first, but not those it is still making."""
@@ -71,10 +90,5 @@ class Session:
 
     def _load_reference(self, scene: Scene) -> np.ndarray:
         """Points (N, 3) float32 of the scene's first visit, map frame."""
-        first = self._store.index.scans_of_scene(scene.scene_id, visit=1)
-        chosen = np.unique(np.linspace(0, len(first.scan_id) - 1, REFERENCE_SCANS).round().astype(int))
-        scans = [self._store.scans.read(int(first.session[i]), int(first.scan_id[i])) for i in chosen]
-        range_m = self._config.alignment.range_m
-        # Ten scans fill the registration's voxels many times over: half of their columns are enough.
-        clouds = [map_points(scan, self._sensors.get(scan.sensor_digest), range_m, every=2) for scan in scans]
-        return np.concatenate(clouds)
+        first_visit = self._store.index.scans_of_scene(scene.scene_id, visit=1)
+        return reference_points(first_visit, self._store.scans, self._sensors, self._config.alignment.range_m)

@@ -60,10 +60,11 @@ class IndexStore:
         config: str,
         software_version: str,
         map_id: int | None = None,
+        continues: int | None = None,
     ) -> int:
         """Note a new session and return its id. map_id None: it makes a new map, whose id is the session's.
 
-        Closes what a killed process left open.
+        continues: the session that goes on as this one, in an older map. Closes what a killed process left open.
         """
         with self._db.transaction():
             self._close_open_visits()
@@ -79,6 +80,7 @@ class IndexStore:
                 "clock_source": clock_source,
                 "config": config,
                 "software_version": software_version,
+                "continues": continues,
             }
             session_id = self._db.insert("sessions", row)
             if map_id is None:
@@ -93,8 +95,16 @@ class IndexStore:
 
     def sessions(self) -> list[SessionRow]:
         """All sessions, oldest first."""
-        columns = "session_id, map_id, source, sensor_digest, started_host_ns, config"
+        columns = "session_id, map_id, source, sensor_digest, started_host_ns, config, continues"
         return [SessionRow(**row) for row in self._db.rows(f"SELECT {columns} FROM sessions ORDER BY session_id")]
+
+    def maps_to_join(self) -> list[int]:
+        """Maps that have scenes and were not given up for an older one, oldest first."""
+        rows = self._db.tuples(
+            """SELECT DISTINCT map_id FROM scenes
+               WHERE map_id NOT IN (SELECT continues FROM sessions WHERE continues IS NOT NULL) ORDER BY map_id"""
+        )
+        return [row[0] for row in rows]
 
     def _close_open_visits(self) -> None:
         """A visit ends with its last scan where nobody noted its end."""
@@ -146,6 +156,19 @@ class IndexStore:
             "SELECT scan_id, descriptor FROM descriptors WHERE model_id = ? ORDER BY scan_id", (model_id,)
         )
         return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
+
+    def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of all scans in scenes of some maps, described by this model: scene (N,), map (N,), descriptor (N, D)."""
+        maps = list(maps)
+        rows = self._db.tuples(
+            f"""SELECT s.scene_id, s.map_id, d.descriptor
+                FROM scenes AS s JOIN visits USING (scene_id) JOIN visit_scans USING (visit_id)
+                     JOIN descriptors AS d USING (scan_id)
+                WHERE d.model_id = ? AND s.map_id IN ({", ".join("?" * len(maps))}) ORDER BY s.scene_id, scan_id""",
+            (model_id, *maps),
+        )
+        scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
+        return scene, map_id, _descriptors([row[2] for row in rows])
 
     # Scenes and visits --------------------------------------------------------------------------------------------
 

@@ -22,6 +22,7 @@ class SessionRow:
     sensor_digest: str
     started_host_ns: int
     config: str  # TOML
+    continues: int | None  # the session that went on as this one when its place in the map was found
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,6 +95,12 @@ CREATE TABLE instances (               -- one run of change detection: a visit a
 CREATE INDEX instances_by_scene ON instances (scene_id);
 """
 
+INDEX_V2 = """
+ALTER TABLE sessions ADD COLUMN continues INTEGER REFERENCES sessions (session_id);
+                                       -- the session that found its place in this one's map and went on as this one;
+                                       -- its own map was given up. NULL: this one began with a new odometry
+"""
+
 CHANGES_V1 = """
 CREATE TABLE store (                   -- which data directory this file belongs to
     only_row        INTEGER PRIMARY KEY CHECK (only_row = 1),
@@ -194,5 +200,5 @@ SELECT o.change_id, c.polarity, o.kind AS seen_as, o.session_id, o.scene_id, o.v
 FROM observations AS o JOIN changes AS c ON c.id = o.change_id ORDER BY o.observation_id;
 """
 
-INDEX_MIGRATIONS = (INDEX_V1,)
+INDEX_MIGRATIONS = (INDEX_V1, INDEX_V2)
 CHANGES_MIGRATIONS = (CHANGES_V1, CHANGES_V2)

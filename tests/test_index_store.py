@@ -128,6 +128,30 @@ def test_scenes_come_back_with_hull_and_number_of_visits(index, session):
     assert index.next_scene_id() == 2
 
 
+def test_a_map_that_was_given_up_for_an_older_one_is_not_joined_again(index, session):
+    index.add_scene(1, session, np.array([[0.0, 0.0]]), 2.5, 20.0)
+    alone = index.start_session(**SESSION)
+    assert index.maps_to_join() == [session]  # what has no scene is no map to come back to
+    index.add_scene(2, alone, np.array([[0.0, 0.0]]), 2.5, 20.0)
+    assert index.maps_to_join() == [session, alone]
+    joined = index.start_session(**SESSION, map_id=session, continues=alone)
+    assert index.maps_to_join() == [session]
+    assert [row.continues for row in index.sessions()] == [None, None, alone]
+    assert index.sessions()[-1].session_id == joined
+
+
+def test_descriptors_come_with_the_scenes_and_maps_of_their_scans(index, session):
+    other = index.start_session(**SESSION)
+    for scene, map_id, scan_ids in ((1, session, [1, 2]), (2, other, [3])):
+        index.add_scene(scene, map_id, np.array([[0.0, 0.0]]), 2.5, 20.0)
+        add_visit(index, scene, 1, map_id, scan_ids)
+    scene, map_id, descriptors = index.scene_descriptors("feedc0ffee00", [session, other])
+    assert (scene.tolist(), map_id.tolist()) == ([1, 1, 2], [session, session, other])
+    np.testing.assert_array_equal(descriptors, [make_scan(i).descriptor for i in (1, 2, 3)])
+    assert index.scene_descriptors("feedc0ffee00", [other])[0].tolist() == [2]
+    assert len(index.scene_descriptors("another model", [session, other])[0]) == 0
+
+
 def test_two_visits_of_a_scene_cannot_have_the_same_number(index, session):
     index.add_scene(1, session, np.array([[0.0, 0.0]]), 2.5, 20.0)
     index.open_visit(1, 1, session, 0)

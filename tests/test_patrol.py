@@ -11,15 +11,10 @@ from revisitd.daemon.config import Config
 from revisitd.daemon.replay import replay
 from revisitd.storage.store import Store
 
-virtual = pytest.importorskip("revisitd.drivers.virtual", reason="the virtual sensor needs the extra [sim]")
-
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    """There and back again past a crate that is taken away and a person who comes; people walk about."""
-    return virtual.simulate(
-        tmp_path_factory.mktemp("patrol"), scenario="tiny", seed=0, beams=64, profile="RNG15_RFL8_NIR8"
-    )
+def capture(tiny_patrol):
+    return tiny_patrol
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from revisitd.daemon.comparison import Job, Selection
 from revisitd.daemon.config import Config
 from revisitd.daemon.detection.results import Thresholds
-from revisitd.daemon.detection_process import ComparisonFailed, DetectionProcess
+from revisitd.daemon.detection_process import DetectionProcess, JobFailed
 from revisitd.daemon.worker import DetectionWorker, Instance
 from revisitd.storage.store import Store
 
@@ -68,18 +68,18 @@ def process(tmp_path):
 
 
 def job():
-    scans = Selection(np.array([1]), np.array([7]), np.array([1]), np.zeros((1, 3)), np.array([True]))
+    scans = Selection(*np.array([[1], [7], [1], [0]]), np.zeros((1, 3)), np.array([True]))
     return Job(scans, scans, [], [], 25.0, Thresholds(**Config().detection.model_dump()))
 
 
 def test_a_scan_that_is_gone_fails_the_comparison_and_is_named(process):
-    with pytest.raises(ComparisonFailed, match="ScanFileError: .*7.scan"):
+    with pytest.raises(JobFailed, match="ScanFileError: .*7.scan"):
         process.compare(job())
 
 
 def test_a_killed_detection_process_fails_one_comparison_and_is_replaced(process):
     os.kill(process._process.pid, signal.SIGKILL)
-    with pytest.raises(ComparisonFailed, match="died .exit code -9."):
+    with pytest.raises(JobFailed, match="died .exit code -9."):
         process.compare(job())
-    with pytest.raises(ComparisonFailed, match="ScanFileError"):
+    with pytest.raises(JobFailed, match="ScanFileError"):
         process.compare(job())

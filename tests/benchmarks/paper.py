@@ -128,7 +128,7 @@ def single_scans(data: Path, whole_map: bool) -> Runs:
                 if last_at is not None and np.linalg.norm(at - last_at) < SCAN_EVERY_M:
                     continue
                 last_at = at
-                ids = scans.session[[i]], scans.scan_id[[i]], scans.visit_number[[i]]
+                ids = scans.session[[i]], scans.scan_id[[i]], scans.visit_number[[i]], scans.stamp_ns[[i]]
                 scan = Selection(*ids, at[None], np.ones(1, bool))
                 before = _nearest(first_pass, at) if whole_map else job.cumulative
                 one = Job(before, scan, job.erasures, [], job.range_m, detection._thresholds)
@@ -141,8 +141,10 @@ def single_scans(data: Path, whole_map: bool) -> Runs:
 def _first_pass(store: Store) -> Selection:
     path = store.index.trajectory()
     first = path.only(~path.aligned)
-    n = len(first.scan_id)
-    return Selection(first.session, first.scan_id, np.ones(n, np.int64), first.T_map_sensor[:, :3, 3], np.ones(n, bool))
+    n, position_m = len(first.scan_id), first.T_map_sensor[:, :3, 3]
+    return Selection(
+        first.session, first.scan_id, np.ones(n, np.int64), first.stamp_ns, position_m, np.ones(n, dtype=bool)
+    )
 
 
 def _nearest(selection: Selection, at: np.ndarray) -> Selection:

@@ -6,7 +6,6 @@ import shutil
 import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
-from unittest import mock
 
 from revisitd.daemon.comparer import Comparer
 from revisitd.daemon.comparison import Comparison, Job
@@ -77,8 +76,7 @@ def model_of(store: Store) -> str:
 
 def detection_on(store: Store, config: Config) -> ChangeDetection:
     """The change detection of an open store, in this process."""
-    with mock.patch("revisitd.daemon.instances.DetectionProcess", InProcess):
-        return ChangeDetection(config, store, model_of(store))
+    return ChangeDetection(config, store, InProcess(store.dir.path), model_of(store))
 
 
 def detect_again(data: Path, config: Config) -> list[tuple[float, int]]:
