@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from .relocalization import Answer, Question, Relocator
 
 logger = logging.getLogger(__name__)
 
+KEEP_PLACES_S = 60.0  # after the last question: the session has joined, and its places take 90 MB
 NICENESS = 5  # the frame loop goes first on two cores
 
 
@@ -88,6 +90,7 @@ def _serve(connection: Connection, data: Path) -> None:
 
     comparer: Comparer | None = None
     relocator: Relocator | None = None
+    asked_s = 0.0  # when it was asked last
     while True:
         try:
             job = connection.recv()
@@ -96,8 +99,11 @@ def _serve(connection: Connection, data: Path) -> None:
         try:
             if isinstance(job, Question):
                 relocator = relocator or Relocator(data, job.alignment)
+                asked_s = time.monotonic()
                 answer = relocator.locate(job)
             else:
+                if relocator is not None and time.monotonic() - asked_s > KEEP_PLACES_S:
+                    relocator = None
                 comparer = comparer or Comparer(data)
                 answer = comparer.compare(job)
         except Exception as error:  # whatever went wrong is the parent's to judge

@@ -17,7 +17,8 @@ from .relocalization import Answer, Question, same_pose
 
 logger = logging.getLogger(__name__)
 
-EVERY_M = 5.0  # of travel between two questions
+EVERY_M = 5.0  # of travel between two questions; each takes the child about a second
+PATIENT, SELDOM_M = 10, 25.0  # after so many in vain the robot is somewhere else: it is asked less often
 AGREE_M, AGREE_DEG = 0.3, 2.0  # between two answers, some metres of odometry apart
 
 Locate = Callable[[Question], "Future[Answer]"]
@@ -42,6 +43,7 @@ class Joiner:
         self._locate, self._maps, self._alignment, self._wait = locate, maps, alignment, wait
         self._position: np.ndarray | None = None
         self._due_m = 0.0  # travel until the next question
+        self._n_asked = 0
         self._asked: tuple[Future[Answer], np.ndarray] | None = None  # and T_odom_sensor of the scan asked about
         self._known: Join | None = None  # by one answer: not yet believed
 
@@ -51,7 +53,8 @@ class Joiner:
         if self._asked is None and self._due_m <= 0.0:
             question = Question(scan.session, scan.scan_id, self._maps, self._alignment)
             self._asked = self._locate(question), scan.T_odom_sensor
-            self._due_m = EVERY_M
+            self._n_asked += 1
+            self._due_m = EVERY_M if self._n_asked < PATIENT or self._known else SELDOM_M
         if self._asked is None or not (self._wait or self._asked[0].done()):
             return None
         (future, T_odom_sensor), self._asked = self._asked, None

@@ -35,7 +35,7 @@ MIN_INLIERS = 0.8
 MIN_UPRIGHT_POINTS = 500  # on an open field nothing tells one place from another
 CLEARLY = 0.2  # the second best pose must be so much worse
 SAME_M, SAME_DEG = 1.0, 5.0  # poses nearer than both are one
-CACHED_PLACES, CACHED_SURFACES = 64, 4  # 1 MB and 10 MB each
+CACHED_PLACES, CACHED_SURFACES = 20, 2  # 3 MB and 13 MB each
 
 
 @dataclass(frozen=True, eq=False)
