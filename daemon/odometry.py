@@ -26,7 +26,8 @@ MIN_POINTS = 1000  # fewer registrable returns than this say nothing about a pos
 CHECK_EVERY = 5  # frames between two looks at the overlap (30 ms each)
 OVERLAP_SAMPLE = 1000
 MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth
-LEVEL_FRAMES, SPEED_FRAMES = 5, 3  # over which the motion is smoothed
+SPANS = (1, 3, 5)  # frames over which the motion may be smoothed
+FORGET = 0.1  # what the last frame weighs in the choice between them
 
 
 class Health(str, Enum):
@@ -53,31 +54,40 @@ class Motion:
 
 
 class SteadyMotion:
-    """The sensor's motion in one frame period, smoothed over the last frames.
+    """The sensor's motion in one frame period, smoothed as far as the smoothing predicts what comes next.
 
-    KISS-ICP's steps from frame to frame shake by 7 cm in height and 0.4 degrees in roll and pitch, much more than a
-    driven robot does, and a sweep that is deskewed by such a step bends. Height, roll and pitch hardly ever go on for
-    half a second: their mean is nearer to the truth. Speed changes within three frames, heading at once.
+    On a wheeled robot KISS-ICP's steps from frame to frame shake by 7 cm in height and 0.4 degrees in roll and pitch,
+    much more than the robot does, and a sweep that is deskewed by such a step bends: there the mean of five steps is
+    right. One that is carried by hand does roll, step after step: there the last step is. So for each axis the mean
+    of the last one, three or five steps is taken, whichever has been nearest to the step that followed.
     """
 
     def __init__(self) -> None:
-        self._steps: deque[np.ndarray] = deque(maxlen=LEVEL_FRAMES)
+        self._steps: deque[np.ndarray] = deque(maxlen=max(SPANS))
+        self._error = np.zeros((len(SPANS), 6))  # squared, of each span's prediction of each axis, running mean
 
     def add(self, motion: np.ndarray, periods: float) -> None:
         """One more measured motion (4, 4), made in so many frame periods."""
         step = fraction_of(motion, 1.0 / periods)
-        self._steps.append(np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()]))
+        measured = np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()])
+        if self._steps:
+            self._error += FORGET * ((self._means() - measured) ** 2 - self._error)
+        self._steps.append(measured)
 
     def during(self, periods: float) -> np.ndarray:
         """The motion (4, 4) in so many frame periods; none before the first step."""
         if not self._steps:
             return np.eye(4)
-        steps = np.array(self._steps)
-        mean = steps.mean(axis=0)
+        best = self._means()[self._error.argmin(axis=0), np.arange(6)]
         step = np.eye(4)
-        step[:2, 3], step[2, 3] = steps[-SPEED_FRAMES:, :2].mean(axis=0), mean[2]
-        step[:3, :3] = Rotation.from_rotvec([mean[3], mean[4], steps[-1, 5]]).as_matrix()
+        step[:3, 3] = best[:3]
+        step[:3, :3] = Rotation.from_rotvec(best[3:]).as_matrix()
         return fraction_of(step, periods)
+
+    def _means(self) -> np.ndarray:
+        """(spans, 6): the mean of the last one, three, five steps."""
+        steps = np.array(self._steps)
+        return np.stack([steps[-span:].mean(axis=0) for span in SPANS])
 
 
 class Odometry:

@@ -82,23 +82,39 @@ def test_a_long_gap_is_lost_and_a_short_one_is_not(drive):
     assert known.register(frames[25]).health is Health.LOST_GAP
 
 
-def test_the_motion_of_a_sweep_is_not_shaken_by_single_steps_but_turns_at_once():
-    rng = np.random.default_rng(0)
-    steady = SteadyMotion()
+def step_of(xyz, rotvec):
+    step = np.eye(4)
+    step[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
+    step[:3, 3] = xyz
+    return step
+
+
+def test_the_motion_of_a_sweep_is_not_shaken_by_single_steps():
+    rng, steady = np.random.default_rng(0), SteadyMotion()
     assert np.array_equal(steady.during(1.0), np.eye(4))
-    for i in range(20):
-        yaw = 0.0 if i < 19 else np.radians(5)
-        tilt = rng.normal(0, np.radians(0.4), 2)
-        step = np.eye(4)
-        step[:3, :3] = Rotation.from_rotvec([*tilt, yaw]).as_matrix()
-        step[:3, 3] = 0.2, 0.0, rng.normal(0, 0.07)
-        steady.add(step, 1.0)
-    motion = steady.during(1.0)
-    assert abs(motion[2, 3]) < 0.06 and motion[0, 3] == pytest.approx(0.2, abs=0.01)
-    roll, pitch, turned = Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)
-    assert max(abs(roll), abs(pitch)) < 0.4 and turned == pytest.approx(5, abs=0.1)
+    off = []
+    height, tilt = 0.0, np.zeros(2)
+    for _ in range(60):  # a pose that shakes: its steps go to and fro
+        above, tilted = rng.normal(0, 0.05), rng.normal(0, np.radians(0.3), 2)
+        steady.add(step_of([0.2, 0.0, above - height], [*(tilted - tilt), np.radians(1.0)]), 1.0)
+        height, tilt = above, tilted
+        motion = steady.during(1.0)
+        off.append([motion[2, 3], *Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)[:2]])
+    assert np.abs(np.array(off[20:])).mean(axis=0).max() < 0.15 and np.std(np.array(off[20:])[:, 0]) < 0.03
+    assert motion[0, 3] == pytest.approx(0.2, abs=0.01)
     half = steady.during(0.5)
     np.testing.assert_allclose(half @ half, motion, atol=1e-2)
+
+
+def test_a_sensor_that_is_carried_by_hand_is_followed_step_by_step():
+    steady, worst = SteadyMotion(), 0.0
+    for i in range(80):  # rolls three degrees to either side, one and a half times a second
+        rolled = [np.radians(3) * np.sin(2 * np.pi * 1.5 * t) for t in (0.1 * i, 0.1 * (i - 1))]
+        truth = rolled[0] - rolled[1]
+        steady.add(step_of([0.1, 0.0, 0.0], [truth, 0.0, 0.0]), 1.0)
+        got = Rotation.from_matrix(steady.during(1.0)[:3, :3]).as_rotvec()[0]
+        worst = max(worst, abs(got - truth)) if i > 20 else 0.0
+    assert np.degrees(worst) < 0.1
 
 
 def test_a_motion_over_missing_frames_counts_as_that_of_one():
