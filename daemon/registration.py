@@ -9,7 +9,7 @@ import small_gicp
 
 from .geometry import transform
 
-SCAN_VOXEL_RATIO = 1.6  # a scan is thinner than the surface it is registered to
+SCAN_VOXEL_RATIO = 1.2  # a scan is thinner than the reference it is registered to
 NEIGHBOURS = 10  # for the normals of a scan
 SURFACE_NEIGHBOURS = 12
 STEEP = 0.7  # cosine of a normal with the vertical below which a surface stands upright
