@@ -138,8 +138,10 @@ def _evidence(
     this: Submap, other: Submap, t: Thresholds, glimpses: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of points that stayed through their own visit, three times (N,) bool: which were looked through by the other
-    one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it."""
-    sight_limits = (t.occlusion_margin_m, t.occlusion_range_m)
+    one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it.
+
+    glimpses: for points beside what is sure already, half the margin behind them and glimpses are enough."""
+    sight_limits = (0.5 if glimpses else 1.0) * t.occlusion_margin_m, t.occlusion_range_m
     seen = latest_sight(this.points, other, *sight_limits, t.min_confirming_scans)
     arrivals = this.visit.min() > other.visit.max()  # what left in the middle of an older visit was only passing by
     stay = t.min_showing_scans, t.min_showing_s, glimpses, arrivals
@@ -201,7 +203,8 @@ def _counterparts(
             member = np.flatnonzero(label == i)
             if is_ground_like(near.points[member], other.ground, t.ground_filter_c1_m, t.ground_filter_c2):
                 continue
-            described = _described(polarity, near, member, member, near.points[:0], other.standing, t)
+            more = _completion(near.points[member], near.points[:0], side, other, t)
+            described = _described(polarity, near, member, member, more, other.standing, t)
             counterparts += [described] if described else []
     return counterparts
 
