@@ -24,6 +24,7 @@ COMPLETE_STEP_M = 0.2  # without a gap wider than this
 COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
 COUNTERPART_SHARE = 0.2  # also against the size of what came
 INSIDE_SHARE = 0.7  # of an object's points within another's outline, seen from above: it is a part of that
+LOW_M, LOW_SHARE = 0.4, 0.9  # above the ground, and of its points: an object that is low
 FAR_M = 2.0  # a distance to the other submap beyond this is not measured
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
 
@@ -89,11 +90,17 @@ def _one_way(
             continue
         more = _completion(this.points[sure], this.points[open_], side, other, t)
         found = _described(polarity, this, member, sure, more, other.standing, t)
-        if found is not None:
+        if found is not None and not _is_grass(found, other.ground):
             objects.append(found)
     objects = _joined(objects)
     watch.lap("clusters")
     return Detection(objects, len(this.points), int(confirmed.sum()), watch.seconds)
+
+
+def _is_grass(found: DetectedObject, ground: Ground) -> bool:
+    """Whether an object is low everywhere and owes most of its points to its completion: rough ground, grass."""
+    low = ground.is_under(found.points, 1.0, LOW_M).mean() >= LOW_SHARE
+    return bool(low and found.n_confirmed < MIN_CONFIRMED_SHARE * len(found.points))
 
 
 def _joined(objects: list[DetectedObject]) -> list[DetectedObject]:
