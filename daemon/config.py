@@ -40,7 +40,7 @@ class OdometryConfig(_Section):
     max_range_m: float = Field(80.0, gt=0, description="returns beyond are not registered; also the local map's radius")
     min_range_m: float = Field(1.0, ge=0, description="returns nearer are the robot itself")
     max_points: int = Field(
-        24_000,
+        16_400,
         ge=1000,
         description="pixels given to KISS-ICP, a regular sub-grid of the image; key scans are refined by all of theirs",
     )
