@@ -7,13 +7,9 @@ import numpy as np
 from .jit import kernel
 
 
-def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (3,) of the box around points (N, 3), N > 0; their dtype."""
-    return _bounds(points)
-
-
 @kernel
-def _bounds(points):
+def bounds(points):
+    """Lower and upper corner (3,) of the box around points (N, 3), N > 0; their dtype."""
     lower, upper = points[0].copy(), points[0].copy()
     for i in range(len(points)):
         for axis in range(3):
