@@ -146,6 +146,7 @@ class WorkerConfig(_Section):
     queue_size: int = Field(
         8, ge=1, description="instances that may wait; a live robot drops the newest beyond, and counts it"
     )
+    timeout_s: float = Field(120.0, gt=0, description="an instance that takes longer is ended and recorded as failed")
 
 
 class Config(_Section):

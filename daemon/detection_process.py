@@ -26,23 +26,30 @@ class JobFailed(Exception):
     """The child could not do its job, or died; the message says why."""
 
 
+class Stopped(Exception):
+    """The program ends: the job was given up, and nothing is known against it."""
+
+
 class DetectionProcess:
     """A child that compares and locates. Started at once, so that its imports are done when a job comes.
 
+    timeout_s: a job that takes longer is ended, and its child replaced.
     Thread rule: any thread may call compare and locate; each waits until the child is free.
     """
 
-    def __init__(self, data: Path):
+    def __init__(self, data: Path, timeout_s: float):
         self._data = data
+        self._timeout_s = timeout_s
         self._free = threading.Lock()
+        self._stopped = False
         self._start()
 
     def compare(self, job: Job) -> Comparison:
-        """Run a comparison and wait for it, without holding the interpreter's lock. Raises JobFailed."""
+        """Run a comparison and wait for it, without holding the interpreter's lock. Raises JobFailed, Stopped."""
         return self._run(job)
 
     def locate(self, question: Question) -> Answer:
-        """Look for a key scan in the earlier maps, and wait for it likewise. Raises JobFailed."""
+        """Look for a key scan in the earlier maps, and wait for it likewise. Raises JobFailed, Stopped."""
         return self._run(question)
 
     def _run(self, job: Job | Question) -> Any:
@@ -52,18 +59,35 @@ class DetectionProcess:
     def _run_alone(self, job: Job | Question) -> Any:
         try:
             self._connection.send(job)
+            if not self._connection.poll(self._timeout_s):
+                self._process.kill()
+                raise JobFailed(f"not done after {self._timeout_s:g} s: the detection process was ended and replaced")
             result = self._connection.recv()
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, JobFailed) as error:
             self._process.join(1.0)
             code = self._process.exitcode
+            if self._stopped:
+                raise Stopped from error
             self._start()
+            if isinstance(error, JobFailed):
+                raise
             raise JobFailed(f"the detection process died (exit code {code}); another was started") from error
         if isinstance(result, Exception):
             raise JobFailed(f"{type(result).__name__}: {result}") from result
         return result
 
+    @property
+    def pid(self) -> int:
+        """Of the child; another one after it died."""
+        return self._process.pid
+
+    def kill(self) -> None:
+        """End the child at once, whatever it does; what it was asked raises Stopped, as does all that comes."""
+        self._stopped = True
+        self._process.kill()
+
     def close(self) -> None:
-        """End the child."""
+        """End the child, after the job at hand."""
         self._connection.close()
         self._process.join()
 
@@ -81,7 +105,8 @@ class DetectionProcess:
 
 def _serve(connection: Connection, data: Path) -> None:
     """The child: answers jobs until the parent closes the pipe or dies."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us in order
+    for stop in (signal.SIGINT, signal.SIGTERM):  # for the parent, which ends us in order
+        signal.signal(stop, signal.SIG_IGN)
     os.nice(NICENESS)
     if not os.access(Path(__file__).parent, os.W_OK):
         # Beside an installed package that belongs to root, numba has nowhere to keep what it compiled.

@@ -14,7 +14,7 @@ from .changes import ChangeManager, Finding
 from .comparison import Comparison, Job, Selection
 from .config import Config
 from .detection.results import DetectedObject, Thresholds
-from .detection_process import DetectionProcess, JobFailed
+from .detection_process import DetectionProcess, JobFailed, Stopped
 from .moments import in_order
 from .submaps import select
 from .worker import Instance
@@ -41,6 +41,10 @@ class ChangeDetection:
         self._thresholds = Thresholds(**config.detection.model_dump())
         self.n_changes = 0  # change objects new in this run
 
+    def due(self) -> list[Instance]:
+        """Instances of visits that ended in earlier runs, and of which no run recorded how it went."""
+        return [Instance(**vars(row)) for row in self._store.index.visits_due()]
+
     def run(self, instance: Instance) -> None:
         """Detect the changes of one visit against all visits before, and record how it went."""
         start = time.perf_counter()
@@ -48,6 +52,9 @@ class ChangeDetection:
         try:
             job = self.job(instance)
             comparison = self._process.compare(job)
+        except Stopped:
+            logger.info("instance left for the next start: scene=%d visit=%d", instance.scene_id, instance.visit)
+            return
         except (Rejected, JobFailed) as why:
             status = "rejected" if isinstance(why, Rejected) else "failed"
             logger.info("instance %s scene=%d visit=%d: %s", status, instance.scene_id, instance.visit, why)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from ..drivers.frame import Frame
 from ..drivers.gate import FrameGate, Rejection
 from ..models.descriptor import DescriptorModel
+from ..storage.rows import InstanceRow
 from ..storage.scans import Scan
 from ..storage.store import Store
 from .config import Config
@@ -22,7 +23,7 @@ from .geometry import column_phase, deskew
 from .joining import Join, Joiner, Locate
 from .localization import Fix
 from .memory import return_freed
-from .odometry import Motion
+from .odometry import Health, Motion
 from .relocalization import Answer, Question
 from .scenes import SceneUpdate
 from .sensors import Sensors
@@ -49,6 +50,16 @@ class Counts:
     join_attempts: int = 0
 
 
+@dataclass(frozen=True)
+class Now:
+    """Where the pipeline is, for whoever watches it."""
+
+    session_id: int
+    map_id: int
+    scenes: tuple[int, ...]  # those that the robot is in
+    health: Health  # of the odometry, at the last frame
+
+
 class Pipeline:
     """Takes frames one by one. wait: what to do when the detection lags, wait for it or drop an instance."""
 
@@ -70,11 +81,15 @@ class Pipeline:
         self._source, self._wait = source, wait
         self._session: Session | None = None
         self._joiner: Joiner | None = None  # of a session in a map of its own
+        self._health = Health.GOOD
         self._clock_back = 0  # frames in a row whose time was not after the last accepted one
 
     def process(self, frame: Frame) -> None:
         """One rotation of the sensor."""
         self.counts.frames += 1
+        if self._session is not None and not self._session.is_of(frame.sensor):
+            logger.warning("the sensor was restarted, changed or replaced: a new session begins")
+            self._begin_anew()
         rejection = self.gate.check(frame)
         if rejection is not None:
             self._reject(rejection)
@@ -82,6 +97,7 @@ class Pipeline:
         self._clock_back = 0
         session = self._session or self._start_session(frame)
         motion = session.odometry.register(frame)
+        self._health = motion.health
         if motion.health.lost:
             self._lose_session(motion)
         elif session.key_scans.wants(motion.T_odom_sensor, frame.stamp_ns):
@@ -94,14 +110,25 @@ class Pipeline:
             self._store.index.end_session(self._session.session_id)
             self._session = None
 
+    def now(self) -> Now | None:
+        """The session at hand; None between two."""
+        session = self._session
+        if session is None:
+            return None
+        return Now(session.session_id, session.map_id, tuple(sorted(session.scenes.open_visits)), self._health)
+
     def _reject(self, rejection: Rejection) -> None:
         """A late frame is skipped; a clock that stays back was reset (reboot, looped capture): a session of its own."""
         self.counts.rejected += 1
         self._clock_back = self._clock_back + 1 if rejection is Rejection.TIME_NOT_INCREASING else 0
         if self._clock_back == CLOCK_RESET_FRAMES:
             logger.warning("the sensor's clock began anew")
-            self.finish()
-            self.gate.restart()
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """What comes next has nothing to do with what was before: not its clock, not its odometry."""
+        self.finish()
+        self.gate.restart()
 
     def _keep(self, session: Session, frame: Frame, motion: Motion) -> None:
         """A key scan: find where it is, describe it, store it, and tell the scenes."""
@@ -148,7 +175,9 @@ class Pipeline:
         self.counts.scenes += update.new_scene is not None
         for instance in session.record(update):
             self.counts.instances += 1
-            self._worker.submit(instance, self._wait)
+            if not self._worker.submit(instance, self._wait):
+                full = "the detection's queue was full"
+                self._store.index.record_instance(InstanceRow(instance.scene_id, instance.visit_id, "dropped", full))
         if update.ended_visits:
             return_freed()
 

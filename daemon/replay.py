@@ -5,19 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..drivers.ouster import Source, open_source
-from ..models.descriptor import DescriptorModel
-from ..storage.store import Store
-from .config import Config, dump_config
-from .detection_process import DetectionProcess
-from .instances import ChangeDetection
-from .pipeline import Counts, Pipeline
-from .sensors import Sensors
-from .worker import DetectionWorker
+from .config import Config
+from .pipeline import Counts
+from .program import Program
 
 logger = logging.getLogger(__name__)
 
@@ -46,25 +40,10 @@ def replay(
     Raises DriverError for a source that cannot be read or that held no usable frame, and the storage's errors.
     """
     start = time.perf_counter()
-    with open_source(source, meta) as frames, Store.open_writer(data) as store:
-        (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
-        model = DescriptorModel.load()
-        process = DetectionProcess(store.dir.path)
-        detection = ChangeDetection(config, store, process, model.model_id)
-        worker = DetectionWorker(detection.run, config.worker.queue_size)
-        joining = ThreadPoolExecutor(1, thread_name_prefix="joining")
-        try:
-            recorded = frames.n_frames_estimate is not None  # a live sensor waits for nobody
-            pipeline = Pipeline(
-                config,
-                store,
-                Sensors(store.dir),
-                model,
-                worker,
-                lambda question: joining.submit(process.locate, question),
-                source,
-                wait=recorded and rate is None,
-            )
+    with open_source(source, meta) as frames:
+        recorded = frames.n_frames_estimate is not None  # a live sensor waits for nobody
+        with Program(data, config, source, wait=recorded and rate is None) as program:
+            pipeline, worker, detection = program.pipeline, program.worker, program.detection
             try:
                 for frame in _paced(frames, rate):
                     pipeline.process(frame)
@@ -73,11 +52,7 @@ def replay(
                 logger.info("interrupted: closing the session")
             pipeline.finish()
             worker.drain()
-        finally:
-            worker.close()
-            joining.shutdown(cancel_futures=True)
-            process.close()
-        progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
+            progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)
         pipeline.gate.require_accepted(source)
         return Summary(
             pipeline.counts,

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import database
-from .rows import InstanceRow, SceneRow, SceneScans, SessionRow, Trajectory, VisitRow
+from .rows import DueVisit, InstanceRow, SceneRow, SceneScans, SessionRow, Trajectory, VisitRow
 from .scans import Scan
 from .schema import INDEX_MIGRATIONS
 
@@ -261,6 +261,17 @@ class IndexStore:
             "finished_host_ns": time.time_ns(),
         }
         return self._db.insert("instances", row)
+
+    def visits_due(self) -> list[DueVisit]:
+        """Visits that were to be compared and of which no instance is recorded, oldest first."""
+        rows = self._db.rows(
+            """SELECT v.session_id, s.map_id, v.scene_id, v.visit_id, v.number AS visit, v.t_in_ns, v.t_out_ns
+               FROM visits AS v JOIN scenes AS s USING (scene_id)
+               WHERE v.number >= 2 AND v.t_out_ns IS NOT NULL
+                     AND v.visit_id NOT IN (SELECT visit_id FROM instances)
+               ORDER BY v.visit_id"""
+        )
+        return [DueVisit(**row) for row in rows]
 
     def counts(self) -> dict[str, int]:
         """Rows of each kind, the bytes of all scan files, and the instances by status."""

@@ -50,6 +50,19 @@ class VisitRow:
 
 
 @dataclass(frozen=True)
+class DueVisit:
+    """A visit whose instance of change detection no run has recorded yet."""
+
+    session_id: int
+    map_id: int
+    scene_id: int
+    visit_id: int
+    visit: int  # its number, at least 2
+    t_in_ns: int
+    t_out_ns: int
+
+
+@dataclass(frozen=True)
 class InstanceRow:
     """One run of change detection, as it is recorded."""
 

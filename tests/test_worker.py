@@ -62,7 +62,7 @@ def test_an_instance_that_fails_does_not_end_the_detection_of_others(caplog):
 @pytest.fixture
 def process(tmp_path):
     with Store.open_writer(tmp_path / "data"):
-        started = DetectionProcess(tmp_path / "data")
+        started = DetectionProcess(tmp_path / "data", timeout_s=60.0)
         yield started
         started.close()
 

@@ -1,0 +1,63 @@
+"""What a run of revisitd consists of beside its source: the store, the model, the pipeline, the detection."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+from ..models.descriptor import DescriptorModel
+from ..storage.store import Store
+from .config import Config, dump_config
+from .detection_process import DetectionProcess
+from .instances import ChangeDetection
+from .pipeline import Pipeline
+from .sensors import Sensors
+from .worker import DetectionWorker
+
+
+class Program:
+    """Opens everything in order; a context manager that closes it in the reverse one, when what is queued is done.
+
+    data: the data directory, made if it is not there. source: what the sessions name as their source. wait: for the
+    detection when it lags (a recorded source); a live one drops instances instead, and counts them.
+    Raises the storage's errors, OSError and ModelError.
+    """
+
+    def __init__(self, data: Path, config: Config, source: str, wait: bool):
+        with ExitStack() as opened:
+            self.store = opened.enter_context(Store.open_writer(data))
+            (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
+            self.model = DescriptorModel.load()
+            self.process = DetectionProcess(self.store.dir.path, config.worker.timeout_s)
+            opened.callback(self.process.close)
+            joining = ThreadPoolExecutor(1, thread_name_prefix="joining")
+            opened.callback(joining.shutdown, cancel_futures=True)
+            self.detection = ChangeDetection(config, self.store, self.process, self.model.model_id)
+            # Visits whose instance was still due when the last run ended, killed perhaps.
+            self.worker = DetectionWorker(self.detection.run, config.worker.queue_size, self.detection.due())
+            opened.callback(self.worker.close)
+            self.pipeline = Pipeline(
+                config,
+                self.store,
+                Sensors(self.store.dir),
+                self.model,
+                self.worker,
+                lambda question: joining.submit(self.process.locate, question),
+                source,
+                wait,
+            )
+            self._opened = opened.pop_all()
+
+    def stop(self, within_s: float) -> None:
+        """End the session; let the instance at hand finish if it does so in time, and leave the others for the next
+        run: the index knows them."""
+        self.pipeline.finish()
+        if not self.worker.stop(within_s):
+            self.process.kill()
+
+    def __enter__(self) -> Program:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._opened.close()
