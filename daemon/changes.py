@@ -74,9 +74,7 @@ class ChangeManager:
         """Metadata of all changes of at least n points."""
         return self._store.publish_change_list(n)
 
-    def update_map(
-        self, points: np.ndarray, taken: np.ndarray, map_id: int, until: tuple[int, int]
-    ) -> np.ndarray:
+    def update_map(self, points: np.ndarray, taken: np.ndarray, map_id: int, until: tuple[int, int]) -> np.ndarray:
         """Which points (N, 3) float32 of older scans still stand, by all that was known to be gone at a time.
 
         taken (N, 2) int64: session and sensor time of each point's scan; until: session and sensor time.
@@ -86,9 +84,7 @@ class ChangeManager:
         box = points.min(axis=0), points.max(axis=0)
         return standing(points, np.arange(len(points)), taken, self.erasures(map_id, box, until))
 
-    def erasures(
-        self, map_id: int, box: tuple[np.ndarray, np.ndarray], until: tuple[int, int]
-    ) -> list[Erasure]:
+    def erasures(self, map_id: int, box: tuple[np.ndarray, np.ndarray], until: tuple[int, int]) -> list[Erasure]:
         """Removed objects in a box (lower and upper corner (3,), metres, map frame), first seen gone before a time.
 
         What update_map (detection/erasure.py) takes away. until: session and sensor time.
@@ -99,9 +95,7 @@ class ChangeManager:
         )
         return [Erasure(change.points, change.session, change.first_seen_ns) for change in gone]
 
-    def known(
-        self, map_id: int, box: tuple[np.ndarray, np.ndarray], before: tuple[int, int]
-    ) -> list[KnownChange]:
+    def known(self, map_id: int, box: tuple[np.ndarray, np.ndarray], before: tuple[int, int]) -> list[KnownChange]:
         """Changes in a box that hold, first seen before a time (session, sensor time): what a visit is asked about."""
         held = self._store.changes(map_id=map_id, box=box, before=before)
         return [KnownChange(c.id, c.polarity, c.points) for c in held if c.state == "present"]

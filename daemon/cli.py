@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-import sys
-from pathlib import Path
 
 import click
 
 from .. import __version__
 from ..drivers.errors import BadCapture, BadMetadata, DriverError, SensorUnavailable, SourceNotFound
-from ..storage.errors import StorageError
-from .config import ConfigError, dump_config, load_config
+from ..storage.errors import NewerFormat, StorageError
+from .commands import results, service, settings, sources
+from .config import ConfigError
+from .install import InstallError
+from .notify import log_handler
 
 # sysexits.h; systemd prints these names. 2 is click's own code for a wrong use of a command.
 EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
@@ -21,6 +22,8 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (SensorUnavailable, 69),
     (DriverError, 65),
     (ConfigError, 78),
+    (InstallError, 69),
+    (NewerFormat, 78),
     (StorageError, 74),
     (OSError, 74),
 )
@@ -48,17 +51,6 @@ def _exit_codes():
     return ((ModelError, 78), *EXIT_CODES)
 
 
-DATA = click.option(
-    "--data",
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help="Data directory: scans, index and changes.",
-)
-CONFIG = click.option(
-    "--config", "config_path", type=click.Path(path_type=Path), help="Settings (TOML); defaults without it."
-)
-
-
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="revisitd")
 @click.option("-v", "--verbose", count=True, help="Say more: -v what happens, -vv details.")
@@ -66,208 +58,30 @@ def cli(verbose: int) -> None:
     """Tells what has changed in a place since the robot's earlier visits, from an Ouster OS1's packets.
 
     Exit codes: 0 done, 2 wrong use, 65 bad data (capture or metadata), 66 no such source, 69 sensor not
-    reached, 74 input/output (disk, data directory), 78 settings or model.
+    reached or systemd not there, 74 input/output (disk, data directory), 78 settings, model, or a data directory of a
+    newer revisitd.
     """
     level = {0: logging.ERROR, 1: logging.INFO}.get(verbose, logging.DEBUG)
-    logging.basicConfig(stream=sys.stderr, level=level, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=level, handlers=[log_handler()])
 
 
-@cli.command()
-@click.argument("source")
-@DATA
-@click.option("--meta", type=click.Path(path_type=Path), help="The sensor's metadata JSON, if not beside a capture.")
-@click.option("--rate", default="max", show_default=True, help="'max' (nothing is dropped) or a multiple of real time.")
-@CONFIG
-def replay(source: str, data: Path, meta: Path | None, rate: str, config_path: Path | None) -> None:
-    """Run SOURCE (a pcap, an OSF file, or a sensor's host name) through the whole program.
-
-    The path is the robot's own: gate, odometry, key scans, scenes, change detection. At 'max' the result is the
-    same each time.
-
-    \b
-    Examples:
-      revisitd replay patrol.pcap --data out
-      revisitd replay patrol.pcap --meta os1.json --data out --rate 1.0
-    """
-    from .progress import ReplayProgress, summary_text
-    from .replay import replay as run
-
-    config = load_config(config_path)
-    with ReplayProgress(source) as progress:
-        summary = run(source, data, meta, config, _rate(rate), progress)
-    click.echo(summary_text(summary), err=True)
-
-
-def _rate(text: str) -> float | None:
-    if text == "max":
-        return None
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate < 1000:
-        raise click.BadParameter(f"{text!r} is neither 'max' nor a number above 0", param_hint="--rate")
-    return rate
-
-
-@cli.command()
-@DATA
-@click.option("--format", "form", type=click.Choice(["table", "json", "csv"]), default="table", show_default=True,
-              help="For people, or for programs.")  # fmt: skip
-@click.option("--points", is_flag=True, help="Each change's points too (JSON).")
-@click.option("--min-points", default=0, show_default=True, help="Only changes of at least so many points.")
-def changes(data: Path, form: str, points: bool, min_points: int) -> None:
-    """List the changes found. Metres, in the map frame: the sensor's pose at the end of the first accepted frame
-    of the first session (x forward, y left, z up)."""
-    from ..storage.store import Store
-    from . import report
-
-    with Store.open_reader(data) as store:
-        found = store.changes.changes(min_points=min_points, with_points=points)
-    if form == "table":
-        click.echo(report.changes_table(found))
-    elif form == "csv":
-        click.echo(report.changes_csv(found), nl=False)
-    else:
-        click.echo(report.changes_json(found, with_points=points))
-
-
-@cli.command(context_settings={"ignore_unknown_options": True})  # -3.5 is a coordinate
-@click.argument("x", type=float)
-@click.argument("y", type=float)
-@click.argument("z", type=float)
-@DATA
-@CONFIG
-@click.option("--radius", default=0.3, show_default=True, help="Of the place, metres.")
-@click.option("--map", "map_id", type=int, help="Of which map; the newest without it.")
-@click.option("--format", "form", type=click.Choice(["table", "json"]), default="table", show_default=True,
-              help="For people, or for programs.")  # fmt: skip
-def place(
-    x: float, y: float, z: float, data: Path, config_path: Path | None, radius: float, map_id: int | None, form: str
-) -> None:
-    """Say what each visit saw at X Y Z (metres, map frame): the same as before, a change, or nothing."""
-    import numpy as np
-
-    from ..storage.store import Store
-    from . import report
-    from .places import place_history
-
-    config = load_config(config_path)
-    with Store.open_reader(data) as store:
-        maps = [scene.map_id for scene in store.index.scenes()]
-        map_id = map_id if map_id is not None else max(maps, default=0)
-        history = place_history(store, map_id, np.array([x, y, z]), radius, config.detection)
-    click.echo(report.place_json(history) if form == "json" else report.place_table(history))
-
-
-@cli.command()
-@DATA
-@click.option("--session", type=int, help="Of one session only.")
-def trajectory(data: Path, session: int | None) -> None:
-    """Print the key scans' poses in the map frame, TUM format: t x y z qx qy qz qw (seconds, sensor clock)."""
-    from ..storage.store import Store
-    from . import report
-
-    with Store.open_reader(data) as store:
-        path = store.index.trajectory(session)
-    click.echo(report.trajectory_tum(path.stamp_ns, path.T_map_sensor), nl=False)
-
-
-@cli.command()
-@DATA
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="PNG to write.")
-def plot(data: Path, output: Path) -> None:
-    """Draw a map seen from above: trajectory, scenes, and changes by polarity."""
-    from .plot import plot_map
-
-    plot_map(data, output)
-    click.echo(output)
-
-
-@cli.command()
-@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
-@click.option("--scenario", default="short", show_default=True, help="See --list.")
-@click.option("--seed", default=0, show_default=True, help="Another seed is another world and another patrol.")
-@click.option("--beams", type=click.Choice(["32", "64", "128"]), default="128", show_default=True, help="Of the OS1.")
-@click.option("--columns", type=click.Choice(["512", "1024", "2048"]), default="1024", show_default=True,
-              help="Of a rotation.")  # fmt: skip
-@click.option("--profile", default="RNG19_RFL8_SIG16_NIR16", show_default=True, help="Of the lidar packets.")
-@click.option("--list", "list_", is_flag=True, is_eager=True, expose_value=False, callback=lambda *a: _list(*a),
-              help="List the scenarios.")  # fmt: skip
-def simulate(out: Path, scenario: str, seed: int, beams: str, columns: str, profile: str) -> None:
-    """Write a virtual patrol as OS1 packets: OUT/*.pcap, its metadata, and the truth (needs the extra [sim])."""
-    capture = _simulate(out, scenario, seed, int(beams), int(columns), profile)
-    click.echo(f"{capture.pcap}\n{capture.metadata}\n{capture.truth}")
-
-
-def _simulate(out: Path, scenario: str, seed: int, beams: int, columns: int, profile: str):
-    virtual = _virtual()
-    if scenario not in virtual.SCENARIOS:
-        known = ", ".join(virtual.SCENARIOS)
-        raise click.BadParameter(f"{scenario!r} is not known; known: {known}", param_hint="--scenario")
-    with click.progressbar(length=1000, label=f"simulating {scenario}", file=sys.stderr) as bar:
-        done = 0
-
-        def progress(frame: int, n_frames: int) -> None:
-            nonlocal done
-            step = 1000 * frame // n_frames - done
-            bar.update(step)
-            done += step
-
-        return virtual.simulate(
-            out, scenario=scenario, seed=seed, beams=beams, columns=columns, profile=profile, progress=progress
-        )
-
-
-def _virtual():
-    try:
-        from ..drivers import virtual
-    except ImportError as error:
-        raise click.ClickException(f"the virtual sensor needs the extra [sim] ({error.name} is missing)") from error
-    return virtual
-
-
-def _list(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
-    if wanted and not ctx.resilient_parsing:
-        for name, scenario in _virtual().SCENARIOS.items():
-            click.echo(f"{name:10s} {scenario.about}")
-        ctx.exit()
-
-
-@cli.command()
-@click.argument("out", type=click.Path(file_okay=False, path_type=Path), default=Path("demo"))
-@click.option("--seed", default=0, show_default=True, help="Another seed is another world.")
-@click.pass_context
-def demo(ctx: click.Context, out: Path, seed: int) -> None:
-    """See it work without a robot: a virtual patrol, its packets replayed, the changes found, a picture.
-
-    Writes OUT/patrol (capture and truth), OUT/data (the store) and OUT/map.png.
-    """
-    from .demo import compare_with_truth, fresh
-
-    fresh(out)
-    capture = _simulate(out / "patrol", "demo", seed, 128, 1024, "RNG15_RFL8_NIR8")
-    ctx.invoke(replay, source=str(capture.pcap), data=out / "data", meta=None, rate="max", config_path=None)
-    click.echo()
-    ctx.invoke(changes, data=out / "data", form="table", points=False, min_points=0)
-    click.echo()
-    click.echo(compare_with_truth(out / "data", capture.truth))
-    ctx.invoke(plot, data=out / "data", output=out / "map.png")
-
-
-@cli.command("check-config")
-@click.argument("path", type=click.Path(path_type=Path))
-def check_config(path: Path) -> None:
-    """Check a settings file; exit code 78 and a line for each problem where it is wrong."""
-    load_config(path)
-    click.echo(f"{path}: ok")
-
-
-@cli.command("dump-config")
-@CONFIG
-def dump_config_(config_path: Path | None) -> None:
-    """Print all settings with units, defaults and reasons, as TOML."""
-    click.echo(dump_config(load_config(config_path)), nl=False)
+for command in (
+    sources.demo,
+    sources.replay,
+    service.run,
+    service.status,
+    results.changes,
+    results.place,
+    results.trajectory,
+    results.plot,
+    sources.simulate,
+    settings.dump_config_,
+    settings.check_config,
+    service.doctor,
+    service.install_service,
+    service.uninstall_service,
+):
+    cli.add_command(command)
 
 
 def main() -> None:

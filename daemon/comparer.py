@@ -88,9 +88,7 @@ class _More:
         return self._loaded[nearest].around(lower, upper)
 
     def _load(self, selection: Selection) -> Submap:
-        submap, scans = build_submap(
-            lambda i: self._comparer.read(selection, i), selection.visit, self._job.range_m
-        )
+        submap, scans = build_submap(lambda i: self._comparer.read(selection, i), selection.visit, self._job.range_m)
         facts = _facts(scans, selection.moment)
         self._facts.session.update(facts.session)
         self._facts.stamp_ns.update(facts.stamp_ns)

@@ -88,9 +88,7 @@ class Localizer:
             self._travel_since_fix_m += float(np.linalg.norm(position - self._last_position))
         self._last_position = position
 
-    def _register(
-        self, source: small_gicp.PointCloud, predicted: np.ndarray, scene: Scene, coarse: bool
-    ) -> Match:
+    def _register(self, source: small_gicp.PointCloud, predicted: np.ndarray, scene: Scene, coarse: bool) -> Match:
         gates = [self._config.coarse_gate_m, self._config.gate_m] if coarse else [self._config.gate_m]
         T, surface = predicted, self._reference(scene)
         for gate in gates:

@@ -24,9 +24,7 @@ def inside(points, lower, upper):
     out = np.empty(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        out[i] = (
-            lower[0] < x and x < upper[0] and lower[1] < y and y < upper[1] and lower[2] < z and z < upper[2]
-        )
+        out[i] = lower[0] < x and x < upper[0] and lower[1] < y and y < upper[1] and lower[2] < z and z < upper[2]
     return out
 
 

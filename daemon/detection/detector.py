@@ -69,9 +69,7 @@ def detect(before: Side, now: Side, thresholds: Thresholds) -> Detection:
     )
 
 
-def _one_way(
-    polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thresholds, watch: Stopwatch
-) -> Detection:
+def _one_way(polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thresholds, watch: Stopwatch) -> Detection:
     """Objects among the points of one side that are far from the other's, which could have seen them and did not."""
     this = side.standing.only(is_far)
     this = this.only(dense_enough(this.points, t.rho_m, t.n))
@@ -141,9 +139,7 @@ def _both(whole: DetectedObject, part: DetectedObject) -> DetectedObject:
     )
 
 
-def _evidence(
-    this: Submap, other: Submap, t: Thresholds, glimpses: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _evidence(this: Submap, other: Submap, t: Thresholds, glimpses: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of points that stayed through their own visit, three times (N,) bool: which were looked through by the other
     one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it.
 
@@ -216,9 +212,7 @@ def _counterparts(
     return counterparts
 
 
-def _looked_through_around(
-    points: np.ndarray, side: Side, other: Side, t: Thresholds, glimpses: bool
-) -> Submap:
+def _looked_through_around(points: np.ndarray, side: Side, other: Side, t: Thresholds, glimpses: bool) -> Submap:
     """What stands around some points, by all scans of a side, and was looked through by the other; one per voxel."""
     lower, upper = bounds(points)
     box = lower - np.float32(COMPLETE_M), upper + np.float32(COMPLETE_M)

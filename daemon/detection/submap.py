@@ -67,9 +67,7 @@ class Submap:
         return self.only(arrays.inside(self.points, lower, upper))
 
 
-NO_SCANS = Submap(
-    np.empty((0, 3), np.float32), np.empty(0, np.int16), [], np.empty(0, np.int64), np.empty(0, np.int64)
-)
+NO_SCANS = Submap(np.empty((0, 3), np.float32), np.empty(0, np.int16), [], np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 def join(a: Submap, b: Submap) -> Submap:
