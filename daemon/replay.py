@@ -46,7 +46,7 @@ def replay(
     Raises DriverError for a source that cannot be read or that held no usable frame, and the storage's errors.
     """
     start = time.perf_counter()
-    with open_source(source, meta) as frames, Store.open_writer(data) as store:
+    with open_source(source, meta, wish=config.sensor.wish) as frames, Store.open_writer(data) as store:
         (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
         model = DescriptorModel.load()
         process = DetectionProcess(store.dir.path)
