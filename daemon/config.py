@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from ..drivers.sensor_setup import SensorWish
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -21,6 +24,50 @@ class ConfigError(Exception):
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SensorConfig(_Section):
+    """A live sensor, and how it is set, by its own names; "", 0 or []: as it is. It is always set to send here."""
+
+    address: str = Field("", description="its host name or address, with :port where its HTTP is not at 80")
+    lidar_mode: Literal["", "512x10", "512x20", "1024x10", "1024x20", "2048x10", "4096x5"] = Field(
+        "", description="columns x rotations/s"
+    )
+    udp_profile_lidar: Literal[
+        "",
+        "LEGACY",
+        "RNG15_RFL8_NIR8",
+        "RNG15_RFL8_NIR8_DUAL",
+        "RNG19_RFL8_SIG16_NIR16",
+        "RNG19_RFL8_SIG16_NIR16_DUAL",
+    ] = Field("", description="what a packet carries; RNG15 takes a third of RNG19's network and rounds ranges to 8 mm")
+    timestamp_mode: Literal["", "TIME_FROM_INTERNAL_OSC", "TIME_FROM_SYNC_PULSE_IN", "TIME_FROM_PTP_1588"] = Field(
+        "", description="what the sensor's clock follows; the internal one counts from its power-up"
+    )
+    azimuth_window_mdeg: list[int] = Field(
+        [], description="[from, to], millidegrees: columns outside are not sent; the whole turn is [0, 360000]"
+    )
+    udp_port_lidar: int = Field(0, ge=0, le=65535, description="port here that the sensor sends to")
+    persist: bool = Field(False, description="whether the sensor keeps these settings beyond its next power-up")
+
+    @field_validator("azimuth_window_mdeg")
+    @classmethod
+    def _two_angles(cls, window: list[int]) -> list[int]:
+        if window and not (len(window) == 2 and all(0 <= angle <= 360_000 for angle in window)):
+            raise ValueError("two angles from 0 to 360000, or none")
+        return window
+
+    @property
+    def wish(self) -> SensorWish:
+        """The same for the drivers."""
+        return SensorWish(
+            lidar_mode=self.lidar_mode or None,
+            udp_profile_lidar=self.udp_profile_lidar or None,
+            timestamp_mode=self.timestamp_mode or None,
+            azimuth_window=tuple(self.azimuth_window_mdeg) or None,
+            udp_port_lidar=self.udp_port_lidar or None,
+            persist=self.persist,
+        )
 
 
 class GateConfig(_Section):
@@ -152,6 +199,7 @@ class WorkerConfig(_Section):
 class Config(_Section):
     """All settings of revisitd."""
 
+    sensor: SensorConfig = SensorConfig()
     gate: GateConfig = GateConfig()
     odometry: OdometryConfig = OdometryConfig()
     keyscans: KeyScanConfig = KeyScanConfig()
@@ -208,6 +256,6 @@ def dump_config(config: Config) -> str:
         lines += [f"# {type(value).__doc__}", f"[{section}]"]
         for name, field in type(value).model_fields.items():
             lines.append(f"# {field.description}")
-            lines.append(f"{name} = {getattr(value, name)!r}")
+            lines.append(f"{name} = {json.dumps(getattr(value, name))}")  # of these values also TOML
         lines.append("")
     return "\n".join(lines)

@@ -40,7 +40,7 @@ def replay(
     Raises DriverError for a source that cannot be read or that held no usable frame, and the storage's errors.
     """
     start = time.perf_counter()
-    with open_source(source, meta) as frames:
+    with open_source(source, meta, wish=config.sensor.wish) as frames:
         recorded = frames.n_frames_estimate is not None  # a live sensor waits for nobody
         with Program(data, config, source, wait=recorded and rate is None) as program:
             pipeline, worker, detection = program.pipeline, program.worker, program.detection

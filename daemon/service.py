@@ -41,7 +41,7 @@ class Service:
         with (
             Program(self._data, self._config, address, wait=False) as program,
             Housekeeper(program.store, self._config.storage) as housekeeper,
-            KeptSource(address, self._config.sensor.wish(), self._stop) as source,
+            KeptSource(address, self._config.sensor.wish, self._stop) as source,
         ):
             board = StatusBoard(self._data, program, source, housekeeper)
             notify("READY=1")

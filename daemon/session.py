@@ -46,7 +46,7 @@ class Session:
             product=sensor.product,
             firmware=sensor.firmware,
             profile=sensor.profile,
-            clock_source="sensor",
+            clock_source=sensor.timestamp_mode,
             config=dump_config(config),
             software_version=__version__,
             map_id=join.map_id if join else None,

@@ -18,4 +18,12 @@ class BadCapture(DriverError):
 
 
 class SensorUnavailable(DriverError):
-    """The sensor does not answer, or refuses what is asked of it."""
+    """The sensor does not answer, or does not send."""
+
+
+class SensorRefused(SensorUnavailable):
+    """The sensor answers, but does not take the settings wished for."""
+
+
+class SensorChanged(SensorUnavailable):
+    """The sensor is not any more as it was when it was opened: open it again."""

@@ -16,6 +16,7 @@ class Sensor:
     profile: str  # of the lidar packets, e.g. "RNG19_RFL8_SIG16_NIR16"
     mode: str  # columns x rotations/s, e.g. "1024x10"
     init_id: int  # changes when the sensor restarts or is reconfigured; 0 where the packets carry none
+    timestamp_mode: str  # what its clock follows: "TIME_FROM_INTERNAL_OSC" counts from its power-up
     metadata: str  # the sensor's own JSON, as given
     digest: str  # 16 hex digits; equal digests = equal geometry
     frame_period_ns: int

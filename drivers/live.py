@@ -7,21 +7,28 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from ouster.sdk.core import LidarPacket
+from ouster.sdk.core import LidarPacket, Packet
 from ouster.sdk.sensor import SensorPacketSource
 
 from .beside import read_metadata
-from .errors import BadMetadata, SensorUnavailable
+from .errors import BadMetadata, SensorChanged, SensorUnavailable
 from .frame import Frame
 from .losses import Loss
 from .metadata import parse_metadata, sensor_from_info
 from .packets import FrameAssembler, PacketFilter
-from .sensor_http import SensorHttp, host_of, local_address, prepare_sensor
+from .sensor_http import SensorHttp, resolve
+from .sensor_setup import AS_IT_IS, SensorWish, prepare_sensor
 from .source import Source
 
 BUFFER_S = 1.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
 POLL_S = 0.2  # how soon a stop is noticed
-RESTART_PACKETS = 64  # so many in a row with another init id: the sensor was restarted
+USELESS_PACKETS = 64  # so many in a row that are not the sensor's as it was opened: it is another one now
+USELESS = {
+    Loss.OTHER_INIT_ID: "it was restarted or reconfigured",
+    Loss.OTHER_SENSOR: "what comes is of another sensor",
+    Loss.WRONG_SIZE: "what comes is of another profile or sensor",
+    Loss.WRONG_COLUMN: "what comes is of another lidar mode",
+}
 
 
 class LiveSource(Source):
@@ -29,7 +36,8 @@ class LiveSource(Source):
 
     address: host name or IP, optionally with the HTTP port. meta: the sensor's metadata, where it must not be
     asked and configured. stop: ends the iteration. timeout_s: silence after which iterating raises
-    SensorUnavailable; None waits for ever. After SensorUnavailable, open a new source.
+    SensorUnavailable; None waits for ever. losses: counted on, where the sensor was open before. After
+    SensorUnavailable, open a new source.
     """
 
     def __init__(
@@ -38,65 +46,90 @@ class LiveSource(Source):
         meta: Path | None = None,
         stop: threading.Event | None = None,
         timeout_s: float | None = None,
+        wish: SensorWish = AS_IT_IS,
+        losses: Counter | None = None,
     ):
-        self._host = host_of(address)
+        self._address = address
         self._stop = stop or threading.Event()
         self._timeout_s = timeout_s
-        self.losses: Counter = Counter()
+        self.losses: Counter = Counter() if losses is None else losses
+        sensor_ip, self.our_address = resolve(address)
         if meta:
-            local_address(address)  # whether there is such a host
             text = read_metadata(meta).text
         else:
-            text = json.dumps(prepare_sensor(SensorHttp(address), self._stop))
+            text = json.dumps(prepare_sensor(SensorHttp(address), wish, self.our_address, self._stop))
         self._info = parse_metadata(text)
         self.sensor = sensor_from_info(self._info, text)
         self._filter = PacketFilter(self._info)
-        if not self._filter.port:
+        self.port = self._filter.port
+        if not self.port:
             raise BadMetadata(f"the metadata of {address} names no udp_port_lidar to listen at")
         try:
-            self._packets = SensorPacketSource(self._host, sensor_info=[self._info], buffer_time_sec=BUFFER_S)
+            self._packets = SensorPacketSource(sensor_ip, sensor_info=[self._info], buffer_time_sec=BUFFER_S)
         except RuntimeError as error:
             raise SensorUnavailable(
-                f"cannot listen at UDP port {self._filter.port} for {address} ({error}): "
-                "is another program listening there?"
+                f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
             ) from None
+        self._overflown = self._useless = 0
 
     def __iter__(self) -> Iterator[Frame]:
+        for frame in self.listen():
+            if frame is not None:
+                yield frame
+
+    def listen(self) -> Iterator[Frame | None]:
+        """Frames as they come, and None about every POLL_S in which there is none. Ends when stopped.
+
+        Raises SensorChanged where what comes is not of the sensor as it was opened.
+        """
         assembler = FrameAssembler(self._info, self.losses)
-        for packet in self._lidar_packets():
-            for lidar_frame in assembler.add(packet):
-                yield from self._frames(lidar_frame)
+        heard = told = time.monotonic()
+        while not self._stop.is_set():
+            packet = self._next_packet()
+            now = time.monotonic()
+            if packet is not None:
+                heard = now
+                for lidar_frame in assembler.add(packet):
+                    told = now
+                    yield from self._frames(lidar_frame)
+            elif self._timeout_s and now - heard > self._timeout_s:
+                raise SensorUnavailable(
+                    f"sensor {self._address} has sent nothing to UDP port {self.port} for "
+                    f"{self._timeout_s:g} s: check its udp_dest and the firewall"
+                )
+            if now - told >= POLL_S:
+                told = now
+                yield None
 
     def close(self) -> None:
         self._packets.close()
 
-    def _lidar_packets(self) -> Iterator[LidarPacket]:
-        heard, n_foreign = time.monotonic(), 0
-        while not self._stop.is_set():
+    def _next_packet(self) -> LidarPacket | None:
+        """The next packet that is of use, None where none comes within about POLL_S."""
+        deadline = time.monotonic() + POLL_S
+        while not self._stop.is_set() and time.monotonic() < deadline:
             event = self._packets.get_packet(POLL_S)
             kind = event.type.name  # the SDK exports no name for the enum
-            if kind == "Packet":
-                heard = time.monotonic()
-                fault = self._fault(event.packet())
-                if not fault:
-                    yield event.packet()
-                n_foreign = n_foreign + 1 if fault == Loss.OTHER_INIT_ID else 0
-                if n_foreign >= RESTART_PACKETS:
-                    raise SensorUnavailable(f"sensor {self._host} was restarted or reconfigured: reopen it")
-            elif kind in ("Exit", "Error"):
-                return
-            elif self._timeout_s and time.monotonic() - heard > self._timeout_s:
-                raise SensorUnavailable(
-                    f"sensor {self._host} has sent nothing to UDP port {self._filter.port} for "
-                    f"{self._timeout_s:g} s: check its udp_dest and the firewall"
-                )
+            if kind == "Error":
+                raise SensorUnavailable(f"UDP port {self.port} of sensor {self._address} cannot be read any more")
+            if kind != "Packet":
+                continue
+            fault = self._fault(event.packet())
+            if fault is None:
+                self._useless = 0
+                return event.packet()
+            self._useless += fault in USELESS
+            if self._useless >= USELESS_PACKETS:
+                raise SensorChanged(f"sensor {self._address} must be opened again: {USELESS[fault]}")
+        return None
 
-    def _fault(self, packet) -> Loss | None:
-        self.losses[Loss.OVERFLOW] += self._packets.dropped_packets - self.losses[Loss.OVERFLOW]
+    def _fault(self, packet: Packet) -> Loss | None:
+        self.losses[Loss.OVERFLOW] += self._packets.dropped_packets - self._overflown
+        self._overflown = self._packets.dropped_packets
         if not isinstance(packet, LidarPacket):
             self.losses[Loss.IMU_PACKET] += 1
             return Loss.IMU_PACKET
-        fault = self._filter.fault(packet.buf, self._filter.port)
+        fault = self._filter.fault(packet.buf, self.port)
         if fault:
             self.losses[fault] += 1
         return fault

@@ -77,6 +77,7 @@ def sensor_from_info(info: core.SensorInfo, json_text: str) -> Sensor:
         profile=str(info.format.udp_profile_lidar),
         mode=str(info.config.lidar_mode),
         init_id=int(info.init_id),
+        timestamp_mode=str(info.config.timestamp_mode or "unknown"),
         metadata=json_text,
         digest=geometry_digest(info),
         frame_period_ns=round(1e9 / info.format.fps),

@@ -1,25 +1,26 @@
-"""A live sensor's HTTP interface: read its metadata, and have it send to us.
+"""A live sensor's HTTP interface, firmware 3.1 and later.
 
 Not by the SDK, whose calls hold the GIL until the sensor answers: a slow one would stop every thread.
 """
 
 import json
 import socket
-import threading
 import time
-from http.client import HTTPException
-from ipaddress import ip_address
+from http.client import HTTPException, HTTPResponse
 from urllib.error import HTTPError, URLError
 from urllib.request import ProxyHandler, Request, build_opener
 
-from .errors import SensorUnavailable
+from .errors import SensorRefused, SensorUnavailable
 
-REQUEST_TIMEOUT_S = 4.0
-READY_TIMEOUT_S = 60.0  # a sensor that was switched to NORMAL spins up first
-POLL_S = 0.5
+REQUEST_TIMEOUT_S = 4.0  # of each wait for the network
+ANSWER_TIMEOUT_S = 8.0  # of a whole answer, which may come in drops
 MOST_BYTES = 4 << 20
+SHOWN_BYTES = 200  # of an answer that is quoted
 METADATA = "api/v1/sensor/metadata"
-CONFIG = "api/v1/sensor/config?reinit=true&persist=false"  # gone at the next power-up: it is not our sensor
+CONFIG = "api/v1/sensor/config"
+TELEMETRY = "api/v1/sensor/telemetry"
+ALERTS = "api/v1/sensor/alerts"
+TIME = "api/v1/time"
 
 
 class SensorHttp:
@@ -32,68 +33,70 @@ class SensorHttp:
 
     def metadata(self) -> dict:
         """Raises SensorUnavailable where no Ouster sensor answers."""
-        answer = self._request(METADATA)
-        if not isinstance(answer, dict) or "config_params" not in answer or "sensor_info" not in answer:
+        answer = self.get(METADATA)
+        parts = [answer.get(name) for name in ("config_params", "sensor_info")]
+        if not all(isinstance(part, dict) for part in parts):
             raise SensorUnavailable(f"http://{self.address}/{METADATA} is not a sensor's metadata")
         return answer
 
-    def configure(self, params: dict) -> None:
-        """Sets parameters until the sensor's next power-up, and restarts its lidar with them."""
-        self._request(CONFIG, json.dumps(params).encode())
+    def configure(self, params: dict, persist: bool) -> None:
+        """Sets parameters and restarts the lidar with them; without persist until the sensor's next power-up.
 
-    def _request(self, path: str, body: bytes | None = None):
+        Raises SensorRefused with what the sensor says of a value that it does not take.
+        """
+        path = f"{CONFIG}?reinit=true&persist={str(persist).lower()}"
+        try:
+            self._request(path, json.dumps(params).encode())
+        except HTTPError as error:
+            with error:
+                said = " ".join(_read(error)[:SHOWN_BYTES].decode("utf-8", "replace").split())
+            raise SensorRefused(f"sensor {self.address} refuses {params}: {error.code} {said}") from None
+
+    def get(self, path: str) -> dict:
+        """A JSON object that the sensor tells of itself. Raises SensorUnavailable where there is none."""
+        try:
+            text = self._request(path)
+        except HTTPError as error:
+            error.close()
+            raise SensorUnavailable(
+                f"http://{self.address}/{path} answers {error.code} {error.reason}: "
+                "no Ouster sensor, or firmware before 3.1"
+            ) from None
+        try:
+            answer = json.loads(text)
+        except (ValueError, RecursionError):
+            answer = None
+        if not isinstance(answer, dict):
+            raise SensorUnavailable(f"http://{self.address}/{path} does not answer with JSON: no Ouster sensor")
+        return answer
+
+    def _request(self, path: str, body: bytes | None = None) -> bytes:
+        """The answer; raises HTTPError where it is one of failure."""
         url = f"http://{self.address}/{path}"
         request = Request(url, data=body, headers={"Content-Type": "application/json"})
         try:
             with self._opener.open(request, timeout=REQUEST_TIMEOUT_S) as response:
-                text = response.read(MOST_BYTES)
-        except HTTPError as error:
-            error.close()
-            raise SensorUnavailable(
-                f"{url} answers {error.code} {error.reason}: no Ouster sensor, or firmware before 3.1"
-            ) from None
+                return _read(response)
+        except HTTPError:
+            raise
         except (URLError, OSError, HTTPException, ValueError) as error:
             reason = getattr(error, "reason", error)
             raise SensorUnavailable(
                 f"no sensor answers at http://{self.address} ({reason}): check its power, cable and address"
             ) from None
-        try:
-            return json.loads(text) if text.strip() else {}
-        except ValueError:
-            raise SensorUnavailable(f"{url} does not answer with JSON: no Ouster sensor") from None
 
 
-def prepare_sensor(sensor: SensorHttp, stop: threading.Event) -> dict:
-    """Has the sensor measure and send its packets here; returns its metadata once it runs.
+def resolve(address: str) -> tuple[str, str]:
+    """The sensor's IP address, and that of this machine which it can reach.
 
-    Raises SensorUnavailable where it does not answer or does not get ready; also when stopped.
+    Here and not by the SDK, which holds the GIL while a name is looked up. Raises SensorUnavailable.
     """
-    our_address = local_address(sensor.address)
-    metadata = sensor.metadata()
-    changes = _changes(metadata["config_params"], our_address)
-    if changes:
-        sensor.configure(changes)
-        stop.wait(POLL_S)  # for a moment it still tells the state before
-        metadata = sensor.metadata()
-    deadline = time.monotonic() + READY_TIMEOUT_S
-    while (status := metadata["sensor_info"].get("status")) != "RUNNING":
-        if status == "ERROR" or time.monotonic() > deadline or stop.wait(POLL_S):
-            raise SensorUnavailable(f"sensor {sensor.address} does not run: its status is {status}")
-        metadata = sensor.metadata()
-    left = _changes(metadata["config_params"], our_address)
-    if left:
-        raise SensorUnavailable(f"sensor {sensor.address} does not take {left}")
-    return metadata
-
-
-def local_address(address: str) -> str:
-    """The IP address of this machine that the sensor of this address can reach."""
     host = host_of(address)
     try:
         family, _, _, _, target = socket.getaddrinfo(host, 7502, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect(target)  # sends nothing
-            return probe.getsockname()[0]
+            return target[0], probe.getsockname()[0]
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "not a name"
         raise SensorUnavailable(f"there is no file and no sensor {host} ({reason})") from None
@@ -105,20 +108,12 @@ def host_of(address: str) -> str:
     return host if colon and port.isdigit() and ":" not in host else address
 
 
-def _changes(params: dict, our_address: str) -> dict:
-    """What must be set for the sensor to measure and to send here."""
-    changes = {}
-    if params.get("operating_mode") != "NORMAL":
-        changes["operating_mode"] = "NORMAL"
-    destination = params.get("udp_dest", "")
-    if destination != our_address and not _is_shared(destination):
-        changes["udp_dest"] = our_address
-    return changes
-
-
-def _is_shared(destination: str) -> bool:
-    """Whether packets sent there also reach us: a multicast group, or everyone."""
-    try:
-        return ip_address(destination).is_multicast or destination == "255.255.255.255"
-    except ValueError:
-        return False
+def _read(response: HTTPResponse) -> bytes:
+    """At most MOST_BYTES of an answer. Raises TimeoutError where it does not come to its end."""
+    deadline = time.monotonic() + ANSWER_TIMEOUT_S
+    text = b""
+    while len(text) < MOST_BYTES and (part := response.read1(1 << 16)):
+        text += part
+        if time.monotonic() > deadline:
+            raise TimeoutError("its answer does not end")
+    return text

@@ -3,84 +3,16 @@
 import json
 import socket
 import threading
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import islice
 
 import numpy as np
 import pytest
-from captures import COLUMNS, INIT_ID, metadata, packets, ranges_mm
+from captures import COLUMNS, INIT_ID, packets, ranges_mm
+from fake_sensor import METADATA, fake_sensor
 
 from revisitd.drivers.errors import BadMetadata, SensorUnavailable
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.ouster import open_source
-
-METADATA = "/api/v1/sensor/metadata"
-
-
-class FakeSensor:
-    """Answers HTTP as a sensor does, and sends UDP packets from the same address."""
-
-    def __init__(self, document: dict):
-        self.document = document
-        self.requests: list[tuple[str, str]] = []
-        self.set: list[dict] = []
-        self.accepts = True
-        fake = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self):
-                fake.requests.append(("GET", self.path))
-                fake.answer(self, fake.document if self.path == METADATA else None)
-
-            def do_POST(self):
-                fake.requests.append(("POST", self.path))
-                fake.set.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-                if fake.accepts:
-                    fake.document["config_params"] |= fake.set[-1]
-                fake.document["sensor_info"]["status"] = "RUNNING"
-                fake.answer(self, {})
-
-            def log_message(self, *_):
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.address = f"127.0.0.1:{self.server.server_port}"
-        self.thread = threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True)
-        self.thread.start()
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-
-    def answer(self, handler: BaseHTTPRequestHandler, document: dict | None) -> None:
-        handler.send_response(404 if document is None else 200)
-        handler.end_headers()
-        handler.wfile.write(json.dumps(document).encode())
-
-    def send(self, payloads: list[bytes]) -> None:
-        port = self.document["config_params"]["udp_port_lidar"]
-        for payload in payloads:
-            self.socket.sendto(payload, ("127.0.0.1", port))
-
-    def close(self) -> None:
-        self.server.shutdown()
-        self.thread.join()
-        self.server.server_close()
-        self.socket.close()
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-@contextmanager
-def fake_sensor(profile: str = "RNG19_RFL8_SIG16_NIR16", **changes):
-    fake = FakeSensor(metadata(profile, config_params__udp_port_lidar=free_port(), **changes))
-    try:
-        yield fake
-    finally:
-        fake.close()
 
 
 def test_frames_are_those_that_were_sent():

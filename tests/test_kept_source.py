@@ -1,0 +1,134 @@
+"""A sensor is kept open through all that it and the network do, and what is wrong is stated."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+from captures import metadata, packets, ranges_mm
+from fake_sensor import fake_sensor, free_port
+
+from revisitd.drivers.frame import Frame
+from revisitd.drivers.kept import KeptSource, Phase, SensorState
+from revisitd.drivers.sensor_setup import SensorWish
+
+PATIENCE_S = 10.0
+
+
+class Follower:
+    """Follows a kept source, and collects its frames."""
+
+    def __init__(self, address: str, wish: SensorWish):
+        self.stop = threading.Event()
+        self.source = KeptSource(address, wish, self.stop, first_delay_s=0.05, longest_delay_s=0.4, silence_s=0.25)
+        self.frames: list[Frame] = []
+        self._frames = iter(self.source)
+
+    def until(self, reached: Callable[[SensorState], bool]) -> SensorState:
+        """The state once it is as wanted; a kept source must say something at least once a second."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not reached(self.source.state):
+            asked = time.monotonic()
+            frame = next(self._frames)
+            assert time.monotonic() - asked < 1, "for a second it said nothing"
+            if frame is not None:
+                self.frames.append(frame)
+            assert asked < deadline, self.source.state
+        return self.source.state
+
+    def until_running(self) -> SensorState:
+        return self.until(lambda state: state.phase is Phase.RUNNING)
+
+    def until_problem(self, part: str) -> SensorState:
+        return self.until(lambda state: part in state.problem)
+
+    def until_opened(self, times: int) -> SensorState:
+        return self.until(lambda state: state.n_opened == times)
+
+
+@pytest.fixture
+def follow():
+    followers = []
+
+    def begin(address: str, **wish) -> Follower:
+        followers.append(Follower(address, SensorWish(**wish)))
+        return followers[-1]
+
+    yield begin
+    for follower in followers:
+        follower.stop.set()
+        assert list(follower._frames) in ([], [None])
+
+
+def test_a_sensor_that_is_absent_at_first_is_waited_for(follow):
+    with fake_sensor() as gone:
+        address = gone.address
+    follower = follow(address)
+    state = follower.until_problem("no sensor answers")
+    assert state.phase is Phase.WAITING and state.sensor is None and state.n_opened == 0
+
+
+def test_frames_come_as_they_are_sent_and_the_state_says_so(follow):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        fake.send(packets(fake.document, range(2)))
+        state = follower.until_running()
+        assert state.problem == "" and state.sensor.mode == "512x10"
+        assert (follower.frames[0].range_mm == ranges_mm(0)).all()
+
+
+def test_a_restarted_sensor_is_opened_again_with_its_new_metadata(follow):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        fake.send(packets(fake.document, range(1)))
+        first = follower.until_running().sensor
+        fake.document["sensor_info"]["initialization_id"] += 1
+        follower.until_problem("was restarted or reconfigured")
+        follower.until_opened(2)
+        fake.send(packets(fake.document, range(1)))
+        assert follower.until_running().sensor.init_id == first.init_id + 1
+
+
+def test_a_stream_that_another_client_took_is_named_and_taken_back(follow):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        fake.document["config_params"]["udp_dest"] = "10.5.5.77"
+        state = follower.until_problem("now has udp_dest = '10.5.5.77'")
+        assert "another client took its stream" in state.problem
+        follower.until_opened(2)
+        assert fake.document["config_params"]["udp_dest"] == "127.0.0.1"
+
+
+def test_a_silent_sensor_is_listened_to_and_goes_on_without_being_opened_again(follow):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        assert follower.until_problem("sends nothing to UDP port").phase is Phase.SILENT
+        fake.send(packets(fake.document, range(1)))
+        state = follower.until_running()
+        assert state.problem == "" and state.n_opened == 1
+
+
+def test_a_port_that_is_taken_is_named_and_tried_again(follow):
+    port = free_port()
+    with fake_sensor(config_params__udp_port_lidar=port) as fake:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind(("0.0.0.0", port))
+            follower = follow(fake.address)
+            follower.until_problem(f"cannot listen at UDP port {port}")
+        follower.until_opened(1)
+
+
+def test_the_wish_is_set_on_the_sensor(follow):
+    with fake_sensor() as fake:
+        port = free_port()
+        follower = follow(fake.address, udp_port_lidar=port, timestamp_mode="TIME_FROM_PTP_1588")
+        state = follower.until_opened(1)
+        assert fake.set == [{"timestamp_mode": "TIME_FROM_PTP_1588", "udp_port_lidar": port}]
+        assert state.sensor.timestamp_mode == "TIME_FROM_PTP_1588"
+        fake.send(packets(metadata(), range(1)))
+        follower.until_running()
