@@ -11,7 +11,7 @@ from pathlib import Path
 from .. import __version__
 from ..drivers.kept import KeptSource
 from .housekeeping import Housekeeper
-from .metrics import write_metrics
+from .metrics import METRICS_FILE, write_metrics
 from .notify import notify
 from .pipeline import Now
 from .program import Program
@@ -36,30 +36,30 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 class StatusBoard:
     """Called from the frame loop; writes once a second, and costs a millisecond then."""
 
-    def __init__(
-        self, data: Path, program: Program, source: KeptSource, housekeeper: Housekeeper, metrics: Path | None
-    ):
-        self._data, self._program, self._source, self._housekeeper = data, program, source, housekeeper
-        self._path, self._metrics = status_path(data), metrics
+    def __init__(self, data: Path, address: str, program: Program, source: KeptSource, housekeeper: Housekeeper):
+        self._data, self._address = data, address
+        self._program, self._source, self._housekeeper = program, source, housekeeper
+        self._path = status_path(data)
         self._started_ns = time.time_ns()
         self._shown = 0.0
         self._failed = False
         self._rates: deque[tuple[float, int, int]] = deque([(time.monotonic(), 0, 0)])  # time, frames, columns missing
 
+    def clear(self) -> None:
+        """The service ends: what it wrote of itself is not true any more."""
+        for path in (self._path, self._path.with_name(METRICS_FILE)):
+            path.unlink(missing_ok=True)
+
     def turn(self, now: Now | None) -> None:
         """Once for each turn of the loop."""
-        if time.monotonic() - self._shown >= EVERY_S:
-            self.show(now)
-
-    def show(self, now: Now | None) -> None:
-        """Show the status at once."""
+        if time.monotonic() - self._shown < EVERY_S:
+            return
         self._shown = time.monotonic()
         status = self._status(now)
         notify(f"STATUS={status.line}")
         try:
             write_status(self._path, status)
-            if self._metrics is not None:
-                write_metrics(self._metrics, status)
+            write_metrics(self._path.with_name(METRICS_FILE), status)
             self._failed = False
         except OSError as error:
             if not self._failed:  # the disk may be full for hours: say so once
@@ -88,8 +88,7 @@ class StatusBoard:
         )
 
     def _sensor(self) -> SensorStatus:
-        state, telemetry, sensor = self._source.state, self._source.telemetry, self._source.state.sensor
-        known = {}
+        state, sensor, known = self._source.state, self._source.state.sensor, {}
         if sensor is not None:
             known = {
                 "serial": sensor.serial,
@@ -97,12 +96,9 @@ class StatusBoard:
                 "firmware": sensor.firmware,
                 "profile": sensor.profile,
                 "mode": sensor.mode,
-                "clock": sensor.clock,
+                "clock": sensor.timestamp_mode,
             }
-        if telemetry is not None:
-            known |= {"temperature_c": telemetry.temperature_c, "alerts": telemetry.alerts}
-        address = self._source.address
-        return SensorStatus(address, state.phase, state.problem, state.since_host_ns, state.n_opened, **known)
+        return SensorStatus(self._address, state.phase, state.problem, state.since_ns, state.n_opened, **known)
 
     def _frames(self) -> FrameStatus:
         counts, gate = self._program.pipeline.counts, self._program.pipeline.gate

@@ -69,9 +69,7 @@ def uninstall(root: Path) -> list[str]:
         done.append(f"removed {root / path}")
     if root == Path("/"):
         _run("systemctl", "daemon-reload")
-    done.append(
-        f"kept {root / SETTINGS} and {root / 'var/lib/revisitd'} and the user revisitd: remove them if they are of no use"
-    )
+    done.append(f"kept {root / SETTINGS}, {root / 'var/lib/revisitd'} and the user revisitd")
     return done
 
 

@@ -33,13 +33,21 @@ class ChangeDetection:
     """Runs instances on stored scans; called by the detection thread alone."""
 
     def __init__(self, config: Config, store: Store, process: DetectionProcess, model_id: str):
-        self._config = config
+        self._config = self._wanted = config
         self._store = store
         self._model_id = model_id
         self._manager = ChangeManager(store.changes)
         self._process = process
-        self._thresholds = Thresholds(**config.detection.model_dump())
         self.n_changes = 0  # change objects new in this run
+
+    @property
+    def settings(self) -> str:
+        """Digest of the settings in force."""
+        return self._config.digest
+
+    def use(self, config: Config) -> None:
+        """Other settings, from the next instance on; any thread may call it."""
+        self._wanted = config
 
     def due(self) -> list[Instance]:
         """Instances of visits that ended in earlier runs, and of which no run recorded how it went."""
@@ -48,6 +56,7 @@ class ChangeDetection:
     def run(self, instance: Instance) -> None:
         """Detect the changes of one visit against all visits before, and record how it went."""
         start = time.perf_counter()
+        self._config = self._wanted
         index, row = self._store.index, {"scene_id": instance.scene_id, "visit_id": instance.visit_id}
         try:
             job = self.job(instance)
@@ -108,7 +117,7 @@ class ChangeDetection:
             self._manager.erasures(instance.map_id, box, visited_until),
             self._manager.known(instance.map_id, box, (instance.session_id, instance.t_in_ns)),
             range_m,
-            self._thresholds,
+            Thresholds(**self._config.detection.model_dump()),
         )
 
     def _record(self, comparison: Comparison, instance: Instance) -> int:

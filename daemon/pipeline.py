@@ -43,6 +43,7 @@ class Counts:
     frames: int = 0
     rejected: int = 0
     key_scans: int = 0
+    not_stored: int = 0  # key scans that the disk did not take
     scenes: int = 0
     instances: int = 0
     odometry_lost: int = 0

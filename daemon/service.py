@@ -40,20 +40,20 @@ class Service:
         address = self._config.sensor.address
         with (
             Program(self._data, self._config, address, wait=False) as program,
-            Housekeeper(program.store, self._config.storage) as housekeeper,
-            KeptSource(address, self._config.sensor.wish, self._stop) as source,
+            Housekeeper(program.store) as housekeeper,
         ):
-            board = StatusBoard(self._data, program, source, housekeeper)
+            source = KeptSource(address, self._config.sensor.wish, self._stop)
+            board = StatusBoard(self._data, address, program, source, housekeeper)
             notify("READY=1")
             logger.info("revisitd serves %s, data in %s", address, self._data)
             self._loop(program, source, housekeeper, board)
             notify("STOPPING=1", "STATUS=stopping: the instance at hand may finish")
             program.stop(STOP_S)
-            board.show(final=True)
+            board.clear()
         logger.info("revisitd has stopped")
 
     def _loop(self, program: Program, source: KeptSource, housekeeper: Housekeeper, board: StatusBoard) -> None:
-        watchdog = _Watchdog(program)
+        watchdog = _Watchdog(program, self._config.worker.timeout_s)
         heard = time.monotonic()
         for frame in source:
             if frame is not None:
@@ -85,7 +85,6 @@ class Service:
             taken = [name for name in changed if name in RELOADED]
             self._config = self._config.model_copy(update={name: getattr(wanted, name) for name in taken})
             program.detection.use(self._config)
-            housekeeper.use(self._config.storage)
             waiting = [name for name in changed if name not in RELOADED]
             logger.info("settings reloaded: %s changed", ", ".join(taken) or "nothing")
             if waiting:
@@ -98,8 +97,8 @@ class _Watchdog:
 
     GRACE = 2.0  # a job past its deadline is ended by the detection itself; twice as long, and that failed too
 
-    def __init__(self, program: Program):
-        self._program = program
+    def __init__(self, program: Program, timeout_s: float):
+        self._program, self._timeout_s = program, timeout_s
         self._interval_s = watchdog_interval_s()
         self._fed = 0.0
 
@@ -107,7 +106,7 @@ class _Watchdog:
         now = time.monotonic()
         if self._interval_s is None or now - self._fed < self._interval_s / 2:
             return
-        if self._program.worker.busy_s > self.GRACE * self._program.timeout_s:
+        if self._program.worker.busy_s > self.GRACE * self._timeout_s:
             logger.error("the detection is stuck for %.0f s: the watchdog is not fed", self._program.worker.busy_s)
             return
         notify("WATCHDOG=1")

@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 
-from .preprocess import INPUT_SHAPE, Resampler
+# From release 1.29 on, onnxruntime's Linux wheels tell its maker about each model and machine, and keep a device id
+# in ~/.cache. It looks for this before anything is loaded. A robot's daemon speaks to nobody but its sensor.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+import onnxruntime  # noqa: E402
+
+from .preprocess import INPUT_SHAPE, Resampler  # noqa: E402
 
 DESCRIPTOR_LENGTH = 256
 DEFAULT_MODEL = Path(__file__).with_name("descriptor.onnx")

@@ -37,7 +37,7 @@ def why_not() -> str:
 class BootedSystemd:
     """A context manager. units: file name -> text of what the system manager is to know beside its journal.
 
-    The Python environment of the tests is at /opt/revisitd in there.
+    The Python environment of the tests is at /opt/revisitd in there, with the program at /opt/revisitd/bin/revisitd.
     """
 
     def __init__(self, units: dict[str, str], tmp_path: Path):
@@ -47,7 +47,13 @@ class BootedSystemd:
             (folder / name).write_text(text)
         for name in ("systemd-journald.service", "systemd-journald.socket"):
             (folder / name).write_text((OWN_UNITS / name).read_text())
-        self._environment = {"PATH": os.environ["PATH"], "UNITS": str(folder), "PREFIX": sys.prefix}
+        sites = [path for path in sys.path if path.endswith("-packages")]
+        self._environment = {
+            "PATH": os.environ["PATH"],
+            "UNITS": str(folder),
+            "PYTHON_HOME": sys.base_prefix,
+            "SITES": "\n".join(sites),
+        }
         self._log = tmp_path / "boot.log"
 
     def __enter__(self) -> BootedSystemd:
@@ -105,6 +111,17 @@ class BootedSystemd:
             if time.monotonic() > deadline:
                 journal = self.run("journalctl", "--no-pager", "-n", "40", check=False)
                 raise AssertionError(f"{unit} is {shown}, wanted {wanted}\n{journal}")
+            time.sleep(0.1)
+
+    def until_says(self, unit: str, words: str, timeout_s: float = 30.0) -> None:
+        """Waits until a unit's status line or its journal holds these words."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            said = self.show(unit)["StatusText"] + self.run("journalctl", "--no-pager", "-o", "cat", "-u", unit)
+            if words in said:
+                return
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{unit} did not say {words!r}, but: {said}")
             time.sleep(0.1)
 
     def _wait_for_init(self) -> int:

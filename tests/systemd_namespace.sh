@@ -1,13 +1,29 @@
 #!/bin/bash
 # Becomes the init of a machine of its own, inside mount, pid, uts, ipc and cgroup namespaces (see booted.py): systemd
-# as PID 1, with the units in $UNITS alone and the Python environment $PREFIX at /opt/revisitd. Every place that
-# systemd writes to is private memory, /proc/sys is read-only: nothing reaches the machine that the test runs on.
+# as PID 1, with the units in $UNITS alone. Every place that systemd writes to is private memory, /proc/sys is
+# read-only: nothing reaches the machine that the test runs on.
 set -e
 mount --make-rprivate /
 mount -t tmpfs -o mode=755 tmpfs /opt
-mkdir /opt/revisitd /opt/units
-mount --bind "$PREFIX" /opt/revisitd
+mkdir /opt/units /opt/python /opt/sites
 cp -r "$UNITS"/. /opt/units
+# The tests' own Python environment, put together anew at /opt/revisitd: it may lie in a home that services do not see.
+mount --bind "$PYTHON_HOME" /opt/python
+/opt/python/bin/python3 -m venv --without-pip /opt/revisitd
+number=0
+while IFS= read -r site; do
+    number=$((number + 1))
+    mkdir /opt/sites/$number
+    mount --bind "$site" /opt/sites/$number
+    echo /opt/sites/$number >> "$(echo /opt/revisitd/lib/python3*/site-packages)/tests.pth"
+done <<< "$SITES"
+cat > /opt/revisitd/bin/revisitd <<'END'
+#!/opt/revisitd/bin/python
+from revisitd.daemon.cli import main
+if __name__ == "__main__":
+    main()
+END
+chmod 755 /opt/revisitd/bin/revisitd
 sed '/^revisitd:/d' /etc/passwd > /opt/passwd
 sed '/^revisitd:/d' /etc/group > /opt/group
 echo 'revisitd:x:61234:61234::/var/lib/revisitd:/usr/sbin/nologin' >> /opt/passwd

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from pathlib import Path
 
@@ -43,6 +44,7 @@ def run(source: str | None, data: Path | None, config_path: Path | None) -> None
     state = os.environ.get("STATE_DIRECTORY")
     if data is None and state is None:
         raise click.UsageError("give the data directory with --data")
+    logging.getLogger().setLevel(min(logging.getLogger().level, logging.INFO))
     Service(data or Path(state), config, config_path).run()
 
 
