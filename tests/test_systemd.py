@@ -1,7 +1,6 @@
 """The shipped unit under a real systemd: ready, watched, restarted, stopped; no loop for what does not mend itself."""
 
 import json
-import time
 from pathlib import Path
 
 import pytest
