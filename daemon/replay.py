@@ -14,6 +14,7 @@ from ..models.descriptor import DescriptorModel
 from ..storage.store import Store
 from .config import Config, dump_config
 from .detection_process import DetectionProcess
+from .housekeeping import Housekeeping
 from .instances import ChangeDetection
 from .pipeline import Counts, Pipeline
 from .sensors import Sensors
@@ -52,6 +53,7 @@ def replay(
         process = DetectionProcess(store.dir.path)
         detection = ChangeDetection(config, store, process, model.model_id)
         worker = DetectionWorker(detection.run, config.worker.queue_size)
+        housekeeping = Housekeeping(store, config)
         joining = ThreadPoolExecutor(1, thread_name_prefix="joining")
         try:
             recorded = frames.n_frames_estimate is not None  # a live sensor waits for nobody
@@ -75,6 +77,7 @@ def replay(
             worker.drain()
         finally:
             worker.close()
+            housekeeping.close()
             joining.shutdown(cancel_futures=True)
             process.close()
         progress(pipeline.counts, detection.n_changes, frames.n_frames_estimate)

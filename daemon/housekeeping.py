@@ -1,0 +1,89 @@
+"""The housekeeping thread: keeps the data directory within its limits and backs up what was found."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+from ..storage.backup import back_up_if_due
+from ..storage.errors import StorageError
+from ..storage.retention import RetentionReport
+from ..storage.store import Store
+from .config import Config
+from .instances import submap_scans
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 1.0  # between two looks, where no new scan asks for one
+AGAIN_S = 60.0  # between two attempts at what failed, and between two lines of log that say the same
+# Key scans that may belong to a visit that goes on: it is cut after max_visit_s, at the key scan that follows.
+OPEN_VISITS = 1.5
+
+
+class Housekeeping:
+    """Runs beside the writer until it is closed; a context manager. Nothing that fails here ends the thread."""
+
+    def __init__(self, store: Store, config: Config):
+        self._store, self._config = store, config.storage
+        self._retention = store.retention(
+            quota_bytes=round(config.storage.quota_gb * 1e9),
+            min_free_bytes=round(config.storage.min_free_gb * 1e9),
+            kept_per_visit=submap_scans(config),
+            recent_ns=round(OPEN_VISITS * (config.scenes.max_visit_s + config.keyscans.interval_s) * 1e9),
+        )
+        self.report: RetentionReport | None = None  # of the last look
+        self._said: dict[str, float] = {}
+        self._back_up_after_s = 0.0
+        self._stopped = False
+        self._thread = threading.Thread(target=self._loop, name="housekeeping", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Finish the step at hand and end the thread."""
+        self._stopped = True
+        self._store.grown.set()
+        self._thread.join()
+
+    def __enter__(self) -> Housekeeping:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def _loop(self) -> None:
+        while not self._stopped:
+            self._attempt(self._keep_limits)
+            self._attempt(self._back_up)
+            self._store.grown.wait(PERIOD_S)
+            self._store.grown.clear()
+        logger.debug("housekeeping thread exits")
+
+    def _attempt(self, task) -> None:
+        try:
+            task()
+        except (StorageError, OSError) as error:
+            self._say(str(error))
+        except Exception:
+            logger.exception("housekeeping failed")
+            time.sleep(PERIOD_S)
+
+    def _keep_limits(self) -> None:
+        more = True
+        while more and not self._stopped:
+            self.report = self._retention.step()
+            more = self.report.more
+            if self.report.problem:
+                self._say(self.report.problem)
+
+    def _back_up(self) -> None:
+        if time.monotonic() >= self._back_up_after_s:
+            self._back_up_after_s = time.monotonic() + AGAIN_S
+            back_up_if_due(self._store.dir, self._config.backup_interval_h * 3600.0, self._config.backups_kept)
+
+    def _say(self, problem: str) -> None:
+        """Warn, but not each second of the same."""
+        now = time.monotonic()
+        if now - self._said.get(problem, -AGAIN_S) >= AGAIN_S:
+            self._said = {problem: now}
+            logger.warning("data directory: %s", problem)
