@@ -10,7 +10,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..drivers.kept import KeptSource
-from .housekeeping import Housekeeper
+from .config import Config
 from .metrics import METRICS_FILE, write_metrics
 from .notify import notify
 from .pipeline import Now
@@ -36,9 +36,8 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 class StatusBoard:
     """Called from the frame loop; writes once a second, and costs a millisecond then."""
 
-    def __init__(self, data: Path, address: str, program: Program, source: KeptSource, housekeeper: Housekeeper):
-        self._data, self._address = data, address
-        self._program, self._source, self._housekeeper = program, source, housekeeper
+    def __init__(self, data: Path, program: Program, source: KeptSource, config: Config):
+        self._data, self._program, self._source, self._config = data, program, source, config
         self._path = status_path(data)
         self._started_ns = time.time_ns()
         self._shown = 0.0
@@ -98,7 +97,8 @@ class StatusBoard:
                 "mode": sensor.mode,
                 "clock": sensor.timestamp_mode,
             }
-        return SensorStatus(self._address, state.phase, state.problem, state.since_ns, state.n_opened, **known)
+        address = self._config.sensor.address
+        return SensorStatus(address, state.phase, state.problem, state.since_ns, state.n_opened, **known)
 
     def _frames(self) -> FrameStatus:
         counts, gate = self._program.pipeline.counts, self._program.pipeline.gate
@@ -133,7 +133,7 @@ class StatusBoard:
         )
 
     def _detection(self) -> DetectionStatus:
-        worker, figures = self._program.worker, self._housekeeper.figures
+        worker, figures = self._program.worker, self._program.housekeeping.figures
         return DetectionStatus(
             busy_s=round(worker.busy_s, 1),
             waiting=worker.n_waiting,
@@ -145,15 +145,14 @@ class StatusBoard:
         )
 
     def _store(self) -> StoreStatus:
-        figures = self._housekeeper.figures
+        figures = self._program.housekeeping.figures
         return StoreStatus(
             data=str(self._data.resolve()),
             used_bytes=figures.used_bytes,
-            quota_bytes=figures.quota_bytes,
+            quota_bytes=round(self._config.storage.quota_gb * 1e9),
             free_bytes=figures.free_bytes,
             scans=figures.scans,
-            scans_removed=figures.scans_removed,
-            last_backup_host_ns=figures.last_backup_host_ns,
+            scans_deleted=figures.scans_deleted,
             memory_bytes=_resident_bytes("self"),
             detection_memory_bytes=_resident_bytes(self._program.process.pid),
         )

@@ -196,6 +196,21 @@ class WorkerConfig(_Section):
     timeout_s: float = Field(120.0, gt=0, description="an instance that takes longer is ended and recorded as failed")
 
 
+class StorageConfig(_Section):
+    """The data directory: how large it may grow, and the backups of what was found."""
+
+    quota_gb: float = Field(
+        50.0,
+        gt=0,
+        description="10^9 bytes that the data directory may take, 150 km of key scans; the least useful go first",
+    )
+    min_free_gb: float = Field(
+        2.0, ge=0, description="10^9 bytes to stay free on its file system, for the robot's other programs"
+    )
+    backup_interval_h: float = Field(6.0, gt=0, description="hours between two backups of changes.db")
+    backups_kept: int = Field(8, ge=1, description="backups of changes.db, the newest")
+
+
 class Config(_Section):
     """All settings of revisitd."""
 
@@ -208,6 +223,7 @@ class Config(_Section):
     alignment: AlignmentConfig = AlignmentConfig()
     detection: DetectionConfig = DetectionConfig()
     worker: WorkerConfig = WorkerConfig()
+    storage: StorageConfig = StorageConfig()
 
     @property
     def digest(self) -> str:

@@ -92,7 +92,7 @@ def _data(data: Path, config: Config) -> Iterator[Finding]:
         yield Finding("data", "ok", f"{data}: {counts['scans']} scans, {counts['scenes']} scenes")
     else:
         yield Finding("data", "ok", f"{data}: new")
-    free, wanted = shutil.disk_usage(place).free, 0
+    free, wanted = shutil.disk_usage(place).free, config.storage.min_free_gb * 1e9
     verdict = "ok" if free > wanted else "fail"
     mend = "" if verdict == "ok" else "free some space, or lower storage.min_free_gb"
     yield Finding("disk", verdict, f"{free / 1e9:.1f} GB free, {wanted / 1e9:.1f} GB are to stay free", mend)

@@ -25,6 +25,11 @@ MIN_SCANS = 4  # a submap of fewer says too little: most false changes come from
 REFERENCE_ALPHA_M2 = 120.0  # the scene size at which `submaps.k` is stated; k grows with alpha (CDSD section V)
 
 
+def submap_scans(config: Config) -> int:
+    """How many scans represent a scene of this size."""
+    return max(MIN_SCANS, round(config.submaps.k * config.scenes.alpha_m2 / REFERENCE_ALPHA_M2))
+
+
 class Rejected(Exception):
     """An instance that must not be compared; the message says why."""
 
@@ -94,9 +99,8 @@ class ChangeDetection:
                 f"{len(usable.scan_id)} of {len(scans.scan_id)} scans are aligned to the scene's first visit, "
                 f"at least {MIN_SCANS} are needed"
             )
-        k = max(MIN_SCANS, round(self._config.submaps.k * self._config.scenes.alpha_m2 / REFERENCE_ALPHA_M2))
         chosen = np.zeros(len(usable.scan_id), dtype=bool)
-        chosen[select(usable.descriptors, usable.visit_number, k)] = True
+        chosen[select(usable.descriptors, usable.visit_number, submap_scans(self._config))] = True
         moment = in_order(usable.session, usable.stamp_ns)
         position_m = usable.T_map_sensor[:, :3, 3]
         return Selection(usable.session, usable.scan_id, usable.visit_number, moment, position_m, chosen)

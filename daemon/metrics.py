@@ -57,7 +57,7 @@ def metrics_text(status: Status) -> str:
     gauge("store_quota_bytes", "What it may grow to.", store.quota_bytes)
     gauge("disk_free_bytes", "Free on its file system.", store.free_bytes)
     gauge("scans", "Key scans in the store.", store.scans)
-    counter("scans_removed", "Key scans removed for the quota since the start.", store.scans_removed)
+    counter("scans_deleted", "Key scans removed for the quota since the start.", store.scans_deleted)
     metric(
         "memory_bytes",
         "gauge",

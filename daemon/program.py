@@ -10,6 +10,7 @@ from ..models.descriptor import DescriptorModel
 from ..storage.store import Store
 from .config import Config, dump_config
 from .detection_process import DetectionProcess
+from .housekeeping import Housekeeping
 from .instances import ChangeDetection
 from .pipeline import Pipeline
 from .sensors import Sensors
@@ -33,6 +34,7 @@ class Program:
             opened.callback(self.process.close)
             joining = ThreadPoolExecutor(1, thread_name_prefix="joining")
             opened.callback(joining.shutdown, cancel_futures=True)
+            self.housekeeping = opened.enter_context(Housekeeping(self.store, config))
             self.detection = ChangeDetection(config, self.store, self.process, self.model.model_id)
             # Visits whose instance was still due when the last run ended, killed perhaps.
             self.worker = DetectionWorker(self.detection.run, config.worker.queue_size, self.detection.due())

@@ -15,7 +15,6 @@ from pathlib import Path
 from ..drivers.kept import KeptSource
 from .board import StatusBoard
 from .config import Config, load_config
-from .housekeeping import Housekeeper
 from .notify import notify, notify_reloading, watchdog_interval_s
 from .program import Program
 
@@ -38,21 +37,18 @@ class Service:
         self._listen_to_signals()
         notify("STATUS=opening the store")
         address = self._config.sensor.address
-        with (
-            Program(self._data, self._config, address, wait=False) as program,
-            Housekeeper(program.store) as housekeeper,
-        ):
+        with Program(self._data, self._config, address, wait=False) as program:
             source = KeptSource(address, self._config.sensor.wish, self._stop)
-            board = StatusBoard(self._data, address, program, source, housekeeper)
+            board = StatusBoard(self._data, program, source, self._config)
             notify("READY=1")
             logger.info("revisitd serves %s, data in %s", address, self._data)
-            self._loop(program, source, housekeeper, board)
+            self._loop(program, source, board)
             notify("STOPPING=1", "STATUS=stopping: the instance at hand may finish")
             program.stop(STOP_S)
             board.clear()
         logger.info("revisitd has stopped")
 
-    def _loop(self, program: Program, source: KeptSource, housekeeper: Housekeeper, board: StatusBoard) -> None:
+    def _loop(self, program: Program, source: KeptSource, board: StatusBoard) -> None:
         watchdog = _Watchdog(program, self._config.worker.timeout_s)
         heard = time.monotonic()
         for frame in source:
@@ -64,7 +60,7 @@ class Service:
                 program.pipeline.finish()
             if self._reload.is_set():
                 self._reload.clear()
-                self._reload_settings(program, housekeeper)
+                self._reload_settings(program)
             board.turn(program.pipeline.now())
             watchdog.turn()
 
@@ -73,7 +69,7 @@ class Service:
             signal.signal(stop, lambda *_: self._stop.set())
         signal.signal(signal.SIGHUP, lambda *_: self._reload.set())
 
-    def _reload_settings(self, program: Program, housekeeper: Housekeeper) -> None:
+    def _reload_settings(self, program: Program) -> None:
         """Read the settings again; those that need a restart are named, and wrong ones change nothing."""
         notify_reloading()
         try:
@@ -85,6 +81,7 @@ class Service:
             taken = [name for name in changed if name in RELOADED]
             self._config = self._config.model_copy(update={name: getattr(wanted, name) for name in taken})
             program.detection.use(self._config)
+            program.housekeeping.use(self._config)
             waiting = [name for name in changed if name not in RELOADED]
             logger.info("settings reloaded: %s changed", ", ".join(taken) or "nothing")
             if waiting:

@@ -86,8 +86,7 @@ class StoreStatus:
     quota_bytes: int
     free_bytes: int
     scans: int
-    scans_removed: int  # by retention, since the start
-    last_backup_host_ns: int | None
+    scans_deleted: int  # by retention, since the start
     memory_bytes: int  # resident, of this process
     detection_memory_bytes: int  # resident, of the detection process
 
@@ -170,7 +169,7 @@ def status_table(status: dict) -> str:
         (
             "disk",
             f"{store['data']}: {_gigabytes(store['used_bytes'])} of {_gigabytes(store['quota_bytes'])} used, "
-            f"{_gigabytes(store['free_bytes'])} free, {store['scans']} scans, {store['scans_removed']} removed",
+            f"{_gigabytes(store['free_bytes'])} free, {store['scans']} scans, {store['scans_deleted']} removed",
         ),
         ("memory", f"{store['memory_bytes'] >> 20} + {store['detection_memory_bytes'] >> 20} MiB"),
         ("model", status["model_id"]),

@@ -19,6 +19,7 @@ from . import database
 from .errors import StorageError
 from .schema import CHANGES_MIGRATIONS
 
+BUSY_TIMEOUT_S = 120.0  # the detection thread writes here: it may wait, what it found must not be lost
 POINT_VOXEL_M = 0.05  # a change holds at most one point in each such cube, so that n_points means the same always
 
 
@@ -68,7 +69,7 @@ class ChangeStore:
     @classmethod
     def open_writer(cls, path: Path, store_uuid: str) -> ChangeStore:
         """Open or make. Raises DatabaseFileError, NewerFormat, DataDirError."""
-        return cls(database.open_writer(path, CHANGES_MIGRATIONS, "FULL", store_uuid))
+        return cls(database.open_writer(path, CHANGES_MIGRATIONS, "FULL", BUSY_TIMEOUT_S, store_uuid))
 
     @classmethod
     def open_reader(cls, path: Path) -> ChangeStore:

@@ -6,10 +6,11 @@ one thread is never joined by another's statement. Readers open their own connec
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,23 @@ from urllib.parse import quote
 
 import sqlite_utils
 
-from .errors import DatabaseFileError, DataDirError, NewerFormat
+from .errors import DatabaseCorrupt, DatabaseFileError, DataDirError, NewerFormat, StorageError
+from .faults import naming
 
-BUSY_TIMEOUT_S = 5.0  # a reader's checkpoint or backup may hold the file so long
+Values = Sequence[Any] | Mapping[str, Any]  # for ? or for :name in a statement
+
+logger = logging.getLogger(__name__)
+
+OPENING_TIMEOUT_S = 5.0  # of a lock, while a database is opened
+CHECK_BUDGET_S = 1.0  # a start must not wait longer for a file to be read through: the rest is noticed in use
+CHECK_STEP = 10_000  # of SQLite's virtual machine, some ms, between two looks at the clock
 
 
 class Connection:
-    """One connection, with its lock."""
+    """One connection, with its lock.
+
+    Every method raises the errors of faults.naming: StorageFull, StorageReadOnly, StorageBusy, DatabaseCorrupt, ...
+    """
 
     def __init__(self, connection: sqlite3.Connection, path: Path, writes: bool):
         self._db = sqlite_utils.Database(connection)
@@ -37,23 +48,23 @@ class Connection:
             if self._db.conn.in_transaction:  # the outermost one commits
                 yield
                 return
-            self._db.execute("BEGIN IMMEDIATE")
+            self._execute("BEGIN IMMEDIATE")
             try:
                 yield
-                self._db.execute("COMMIT")
+                self._execute("COMMIT")
             except BaseException:
                 if self._db.conn.in_transaction:
-                    self._db.execute("ROLLBACK")
+                    self._execute("ROLLBACK")
                 raise
 
-    def write(self, sql: str, values: Sequence[Any] = ()) -> int:
+    def write(self, sql: str, values: Values = ()) -> int:
         """Run one statement; the rowid of what it inserted. Durable at once unless in a transaction."""
-        with self._lock:
+        with self._using():
             return self._db.execute(sql, values).lastrowid
 
     def write_many(self, sql: str, rows: list[Sequence[Any]]) -> None:
         """Run one statement for each row, in one transaction."""
-        with self.transaction():
+        with self.transaction(), self._using():
             self._db.conn.executemany(sql, rows)
 
     def insert(self, table: str, row: dict[str, Any]) -> int:
@@ -61,20 +72,26 @@ class Connection:
         marks = ", ".join("?" * len(row))
         return self.write(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
 
-    def rows(self, sql: str, values: Sequence[Any] = ()) -> list[dict[str, Any]]:
+    def rows(self, sql: str, values: Values = ()) -> list[dict[str, Any]]:
         """All rows of a query, as dictionaries."""
-        with self._lock:
+        with self._using():
             return list(self._db.query(sql, values))
 
-    def tuples(self, sql: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+    def tuples(self, sql: str, values: Values = ()) -> list[tuple[Any, ...]]:
         """All rows of a query, as tuples: for the large ones."""
-        with self._lock:
+        with self._using():
             return self._db.execute(sql, values).fetchall()
 
-    def value(self, sql: str, values: Sequence[Any] = ()) -> Any:
+    def value(self, sql: str, values: Values = ()) -> Any:
         """The single value of a query that always has one."""
-        with self._lock:
+        with self._using():
             return self._db.execute(sql, values).fetchone()[0]
+
+    def attach(self, path: Path, name: str, n_migrations: int) -> None:
+        """Read another database too, under a name; for readers. Raises DatabaseFileError, NewerFormat."""
+        open_reader(path, n_migrations).close()
+        with self._using():
+            self._db.execute(f"ATTACH ? AS {name}", (_read_only_uri(path),))
 
     def close(self) -> None:
         """Close the file; a writer leaves all that was written in the file itself, and an empty WAL beside it.
@@ -86,29 +103,64 @@ class Connection:
             if not self._writes:
                 self._db.close()
                 return
-            self._db.execute("PRAGMA busy_timeout = 0")  # a reader at work: leave it the WAL as it is
-            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            with closing(_connect_read_only(self._path)) as keeper:
-                keeper.execute("PRAGMA user_version")
+            try:
+                with naming(self._path):
+                    self._db.execute("PRAGMA busy_timeout = 0")  # a reader at work: leave it the WAL as it is
+                    self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                    with closing(_connect_read_only(self._path)) as keeper:
+                        keeper.execute("PRAGMA user_version")
+                        self._db.close()
+            except StorageError as error:  # full, read-only, damaged: the WAL holds it all, the next start goes on
+                logger.warning("closed without a checkpoint: %s", error)
+            finally:
                 self._db.close()
 
+    def _execute(self, sql: str) -> None:
+        with self._using():
+            self._db.execute(sql)
 
-def open_writer(path: Path, migrations: Sequence[str], synchronous: str, store_uuid: str) -> Connection:
+    @contextmanager
+    def _using(self) -> Iterator[None]:
+        """Alone with the connection. Damage that a writer meets is noted, so that its next start looks closely."""
+        with self._lock:
+            try:
+                with naming(self._path):
+                    yield
+            except DatabaseCorrupt:
+                if self._writes:
+                    suspicion(self._path).touch()
+                raise
+
+
+def suspicion(path: Path) -> Path:
+    """An empty file beside a database that was found damaged in use: it is read through at the next opening."""
+    return path.with_name(f"{path.name}.suspect")
+
+
+def open_writer(
+    path: Path, migrations: Sequence[str], synchronous: str, busy_timeout_s: float, store_uuid: str
+) -> Connection:
     """Open or make a database and bring it to the newest schema.
 
     migrations: SQL scripts; the n-th brings `PRAGMA user_version` from n - 1 to n. synchronous: NORMAL (a power cut
-    may lose the last commits, never the file) or FULL (it loses none). store_uuid ties the file to its data
-    directory. Raises DatabaseFileError, NewerFormat, DataDirError.
+    may lose the last commits, never the file) or FULL (it loses none). busy_timeout_s: how long a write may wait
+    for another program's lock. store_uuid ties the file to its data directory. Raises DatabaseCorrupt,
+    DatabaseFileError, NewerFormat, DataDirError, StorageUnavailable.
     """
-    with _naming(path):
-        connection = sqlite3.connect(path, BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+    with naming(path):
+        connection = sqlite3.connect(path, OPENING_TIMEOUT_S, isolation_level=None, check_same_thread=False)
         try:
+            _refuse_newer(connection, path, len(migrations))
+            _check(connection, path)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute(f"PRAGMA synchronous = {synchronous}")
             connection.execute("PRAGMA foreign_keys = ON")
-            connection.execute("PRAGMA journal_size_limit = 67108864")  # bytes of WAL kept after a busy time
+            # A WAL of 1 MB, 4 MB at most after a time in which a reader held it: it counts towards the quota.
+            connection.execute("PRAGMA wal_autocheckpoint = 250")
+            connection.execute("PRAGMA journal_size_limit = 4000000")
             _migrate(connection, path, migrations)
             _tie(connection, path, store_uuid)
+            connection.execute(f"PRAGMA busy_timeout = {round(busy_timeout_s * 1e3)}")
         except BaseException:
             connection.close()
             raise
@@ -119,7 +171,7 @@ def open_reader(path: Path, n_migrations: int) -> Connection:
     """Open a database for reading only, beside its writer. Raises DatabaseFileError, NewerFormat."""
     if not Path(path).exists():
         raise DatabaseFileError(f"{path}: no such file")
-    with _naming(path):
+    with naming(path):
         connection = _connect_read_only(path)
         try:
             if _refuse_newer(connection, path, n_migrations) < n_migrations:
@@ -130,9 +182,39 @@ def open_reader(path: Path, n_migrations: int) -> Connection:
     return Connection(connection, path, writes=False)
 
 
+def _read_only_uri(path: Path) -> str:
+    return f"file:{quote(str(Path(path).absolute()))}?mode=ro"
+
+
 def _connect_read_only(path: Path) -> sqlite3.Connection:
-    uri = f"file:{quote(str(Path(path).absolute()))}?mode=ro"
-    return sqlite3.connect(uri, BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False, uri=True)
+    how = {"isolation_level": None, "check_same_thread": False, "uri": True}
+    return sqlite3.connect(_read_only_uri(path), OPENING_TIMEOUT_S, **how)
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> None:
+    """Read the file through, for a second at most, or wholly where damage was met in use. Raises DatabaseCorrupt."""
+    doubt = suspicion(path)
+    if doubt.exists():
+        problems = connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
+    else:
+        problems = _quick_check(connection)
+    if problems != "ok":
+        raise DatabaseCorrupt(f"{path}: damaged: {problems.splitlines()[-1]}")
+    doubt.unlink(missing_ok=True)
+
+
+def _quick_check(connection: sqlite3.Connection) -> str:
+    """What quick_check finds in CHECK_BUDGET_S."""
+    deadline = time.monotonic() + CHECK_BUDGET_S
+    connection.set_progress_handler(lambda: time.monotonic() > deadline, CHECK_STEP)
+    try:
+        return connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    except sqlite3.OperationalError as error:
+        if "interrupted" not in str(error):
+            raise
+        return "ok"
+    finally:
+        connection.set_progress_handler(None, 0)
 
 
 def _migrate(connection: sqlite3.Connection, path: Path, migrations: Sequence[str]) -> None:
@@ -165,12 +247,3 @@ def _tie(connection: sqlite3.Connection, path: Path, store_uuid: str) -> None:
         raise DataDirError(
             f"{path}: belongs to data directory {found}, not to this one ({store_uuid}); put the right file back"
         )
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Errors of SQLite do not name the file."""
-    try:
-        yield
-    except sqlite3.DatabaseError as error:
-        raise DatabaseFileError(f"{path}: cannot be opened as a database: {error}") from error

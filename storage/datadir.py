@@ -1,11 +1,12 @@
 """The data directory: what is where, whose it is, and who may write.
 
-    DIR/revisitd.json            uuid and format version of the directory
-    DIR/lock                     held by the writer (flock: a killed process lets go of it)
-    DIR/index.db                 scans, scenes, visits: can be rebuilt from the scan files
-    DIR/changes.db               what changed: precious
-    DIR/sensors/<digest>.json    metadata of each sensor, as it gave it
-    DIR/scans/<session>/...      one file for each key scan
+DIR/revisitd.json            uuid and format version of the directory
+DIR/lock                     held by the writer (flock: a killed process lets go of it)
+DIR/index.db                 scans, scenes, visits: can be rebuilt from the scan files
+DIR/changes.db               what changed: precious
+DIR/sensors/<digest>.json    metadata of each sensor, as it gave it
+DIR/scans/<session>/...      one file for each key scan
+DIR/backups/changes-<UTC>.db copies of changes.db
 """
 
 from __future__ import annotations
@@ -76,6 +77,10 @@ class DataDir:
     @property
     def scans_path(self) -> Path:
         return self.path / "scans"
+
+    @property
+    def backups_path(self) -> Path:
+        return self.path / "backups"
 
     def put_sensor(self, digest: str, metadata: str) -> None:
         """Keep a sensor's metadata JSON under its digest. The first text of a digest stays."""

@@ -25,6 +25,14 @@ def write_atomically(path: Path, data: bytes, temporary_dir: Path) -> None:
     sync_dir(path.parent)
 
 
+def replace_durably(source: Path, path: Path) -> None:
+    """Give a finished file its place, on the same file system, whole also after a power cut."""
+    with open(source, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(source, path)
+    sync_dir(path.parent)
+
+
 def make_dir(path: Path) -> None:
     """Create a directory, with those above it, so that it outlives a power cut."""
     if path.is_dir():

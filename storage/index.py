@@ -19,6 +19,7 @@ from .rows import DueVisit, InstanceRow, SceneRow, SceneScans, SessionRow, Traje
 from .scans import Scan
 from .schema import INDEX_MIGRATIONS
 
+BUSY_TIMEOUT_S = 0.2  # the frame loop writes here: it may be late by two frames, then it goes on without
 POSE = "s.scan_id, s.session_id, s.stamp_ns, s.aligned, s.x, s.y, s.z, s.qx, s.qy, s.qz, s.qw"
 
 
@@ -26,12 +27,12 @@ class IndexStore:
     """The open index. Thread rule: any thread may call any method; one connection behind one lock."""
 
     def __init__(self, connection: database.Connection):
-        self._db = connection
+        self.db = connection  # for the other modules of the storage
 
     @classmethod
     def open_writer(cls, path: Path, store_uuid: str) -> IndexStore:
         """Open or make. Raises DatabaseFileError, NewerFormat, DataDirError."""
-        return cls(database.open_writer(path, INDEX_MIGRATIONS, "NORMAL", store_uuid))
+        return cls(database.open_writer(path, INDEX_MIGRATIONS, "NORMAL", BUSY_TIMEOUT_S, store_uuid))
 
     @classmethod
     def open_reader(cls, path: Path) -> IndexStore:
@@ -39,11 +40,11 @@ class IndexStore:
         return cls(database.open_reader(path, len(INDEX_MIGRATIONS)))
 
     def close(self) -> None:
-        self._db.close()
+        self.db.close()
 
     def transaction(self) -> AbstractContextManager[None]:
         """What is written inside is there whole or not at all: a key scan with its visits, for instance."""
-        return self._db.transaction()
+        return self.db.transaction()
 
     # Sessions -----------------------------------------------------------------------------------------------------
 
@@ -66,7 +67,7 @@ class IndexStore:
 
         continues: the session that goes on as this one, in an older map. Closes what a killed process left open.
         """
-        with self._db.transaction():
+        with self.db.transaction():
             self._close_open_visits()
             row = {
                 "map_id": map_id or 0,
@@ -82,25 +83,25 @@ class IndexStore:
                 "software_version": software_version,
                 "continues": continues,
             }
-            session_id = self._db.insert("sessions", row)
+            session_id = self.db.insert("sessions", row)
             if map_id is None:
-                self._db.write("UPDATE sessions SET map_id = session_id WHERE session_id = ?", (session_id,))
+                self.db.write("UPDATE sessions SET map_id = session_id WHERE session_id = ?", (session_id,))
             return session_id
 
     def end_session(self, session_id: int) -> None:
         """Note the end of a session, and of the visits still open."""
-        with self._db.transaction():
+        with self.db.transaction():
             self._close_open_visits()
-            self._db.write("UPDATE sessions SET ended_host_ns = ? WHERE session_id = ?", (time.time_ns(), session_id))
+            self.db.write("UPDATE sessions SET ended_host_ns = ? WHERE session_id = ?", (time.time_ns(), session_id))
 
     def sessions(self) -> list[SessionRow]:
         """All sessions, oldest first."""
         columns = "session_id, map_id, source, sensor_digest, started_host_ns, config, continues"
-        return [SessionRow(**row) for row in self._db.rows(f"SELECT {columns} FROM sessions ORDER BY session_id")]
+        return [SessionRow(**row) for row in self.db.rows(f"SELECT {columns} FROM sessions ORDER BY session_id")]
 
     def maps_to_join(self) -> list[int]:
         """Maps that have scenes and were not given up for an older one, oldest first."""
-        rows = self._db.tuples(
+        rows = self.db.tuples(
             """SELECT DISTINCT map_id FROM scenes
                WHERE map_id NOT IN (SELECT continues FROM sessions WHERE continues IS NOT NULL) ORDER BY map_id"""
         )
@@ -108,7 +109,7 @@ class IndexStore:
 
     def _close_open_visits(self) -> None:
         """A visit ends with its last scan where nobody noted its end."""
-        self._db.write(
+        self.db.write(
             """UPDATE visits SET t_out_ns = coalesce(
                    (SELECT max(s.stamp_ns) FROM visit_scans AS vs JOIN scans AS s USING (scan_id)
                     WHERE vs.visit_id = visits.visit_id), t_in_ns)
@@ -140,19 +141,19 @@ class IndexStore:
             "model_id": scan.model_id,
             "descriptor": np.asarray(scan.descriptor, "<f4").tobytes(),
         }
-        with self._db.transaction():
-            self._db.insert("scans", row)
-            self._db.insert("descriptors", descriptor)
+        with self.db.transaction():
+            self.db.insert("scans", row)
+            self.db.insert("descriptors", descriptor)
 
     def trajectory(self, session: int | None = None) -> Trajectory:
         """Poses of all key scans, or of one session's."""
         where, values = ("WHERE s.session_id = ?", (session,)) if session is not None else ("", ())
-        rows = self._db.tuples(f"SELECT {POSE} FROM scans AS s {where} ORDER BY s.scan_id", values)
+        rows = self.db.tuples(f"SELECT {POSE} FROM scans AS s {where} ORDER BY s.scan_id", values)
         return Trajectory(**_trajectory_columns(rows))
 
     def all_descriptors(self, model_id: str) -> tuple[np.ndarray, np.ndarray]:
         """Scan ids (N,) int64, ascending, and descriptors (N, D) float32 of all scans described by this model."""
-        rows = self._db.tuples(
+        rows = self.db.tuples(
             "SELECT scan_id, descriptor FROM descriptors WHERE model_id = ? ORDER BY scan_id", (model_id,)
         )
         return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
@@ -160,7 +161,7 @@ class IndexStore:
     def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of all scans in scenes of some maps, described by this model: scene (N,), map (N,), descriptor (N, D)."""
         maps = list(maps)
-        rows = self._db.tuples(
+        rows = self.db.tuples(
             f"""SELECT s.scene_id, s.map_id, d.descriptor
                 FROM scenes AS s JOIN visits USING (scene_id) JOIN visit_scans USING (visit_id)
                      JOIN descriptors AS d USING (scan_id)
@@ -169,6 +170,10 @@ class IndexStore:
         )
         scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
         return scene, map_id, _descriptors([row[2] for row in rows])
+
+    def count_scans(self) -> int:
+        """Key scans in the store."""
+        return self.connection.value("SELECT count(*) FROM scans")
 
     # Scenes and visits --------------------------------------------------------------------------------------------
 
@@ -186,12 +191,12 @@ class IndexStore:
             "area_m2": area_m2,
             "created_host_ns": time.time_ns(),
         }
-        self._db.insert("scenes", row)
+        self.db.insert("scenes", row)
 
     def scenes(self, map_id: int | None = None) -> list[SceneRow]:
         """All scenes of a map, or of all maps, by id."""
         where, values = ("WHERE map_id = ?", (map_id,)) if map_id is not None else ("", ())
-        rows = self._db.rows(
+        rows = self.db.rows(
             f"""SELECT scene_id, map_id, hull, margin_m, area_m2,
                        (SELECT coalesce(max(number), 0) FROM visits WHERE scene_id = scenes.scene_id) AS n_visits
                 FROM scenes {where} ORDER BY scene_id""",
@@ -202,20 +207,20 @@ class IndexStore:
     def open_visit(self, scene_id: int, number: int, session: int, t_in_ns: int) -> int:
         """Note that a visit began; its id."""
         row = {"scene_id": scene_id, "number": number, "session_id": session, "t_in_ns": t_in_ns}
-        return self._db.insert("visits", row)
+        return self.db.insert("visits", row)
 
     def add_visit_scans(self, visit_id: int, scan_ids: Iterable[int]) -> None:
         """Note scans as part of a visit."""
         rows = [(visit_id, scan_id) for scan_id in scan_ids]
-        self._db.write_many("INSERT INTO visit_scans (visit_id, scan_id) VALUES (?, ?)", rows)
+        self.db.write_many("INSERT INTO visit_scans (visit_id, scan_id) VALUES (?, ?)", rows)
 
     def close_visit(self, visit_id: int, t_out_ns: int) -> None:
         """Note that a visit ended."""
-        self._db.write("UPDATE visits SET t_out_ns = ? WHERE visit_id = ?", (t_out_ns, visit_id))
+        self.db.write("UPDATE visits SET t_out_ns = ? WHERE visit_id = ?", (t_out_ns, visit_id))
 
     def visits(self, scene_id: int) -> list[VisitRow]:
         """All visits to a scene, by number."""
-        rows = self._db.rows(
+        rows = self.db.rows(
             """SELECT visit_id, scene_id, number, session_id AS session, t_in_ns, t_out_ns
                FROM visits WHERE scene_id = ? ORDER BY number""",
             (scene_id,),
@@ -229,7 +234,7 @@ class IndexStore:
             where, values = "AND v.number = ?", (scene_id, visit)
         elif before_visit is not None:
             where, values = "AND v.number < ?", (scene_id, before_visit)
-        rows = self._db.tuples(
+        rows = self.db.tuples(
             f"""SELECT {POSE}, v.number, d.model_id, d.descriptor
                 FROM visits AS v JOIN visit_scans USING (visit_id) JOIN scans AS s USING (scan_id)
                      JOIN descriptors AS d USING (scan_id)
@@ -246,9 +251,7 @@ class IndexStore:
     def latest_visit_numbers(self) -> dict[int, int]:
         """Scan id -> the highest number among the visits it is part of; scans outside all scenes are left out."""
         return dict(
-            self._db.tuples(
-                "SELECT scan_id, max(number) FROM visit_scans JOIN visits USING (visit_id) GROUP BY scan_id"
-            )
+            self.db.tuples("SELECT scan_id, max(number) FROM visit_scans JOIN visits USING (visit_id) GROUP BY scan_id")
         )
 
     # Instances ----------------------------------------------------------------------------------------------------
@@ -260,7 +263,7 @@ class IndexStore:
             "stage_seconds": json.dumps(dict(instance.stage_seconds or {})),
             "finished_host_ns": time.time_ns(),
         }
-        return self._db.insert("instances", row)
+        return self.db.insert("instances", row)
 
     def visits_due(self) -> list[DueVisit]:
         """Visits that were to be compared and of which no instance is recorded, oldest first."""
@@ -276,14 +279,14 @@ class IndexStore:
     def counts(self) -> dict[str, int]:
         """Rows of each kind, the bytes of all scan files, and the instances by status."""
         tables = ("sessions", "scans", "scenes", "visits")
-        counts = {table: self._db.value(f"SELECT count(*) FROM {table}") for table in tables}
-        counts["scan_bytes"] = self._db.value("SELECT coalesce(sum(bytes), 0) FROM scans")
+        counts = {table: self.db.value(f"SELECT count(*) FROM {table}") for table in tables}
+        counts["scan_bytes"] = self.db.value("SELECT coalesce(sum(bytes), 0) FROM scans")
         for status in ("done", "rejected", "dropped", "failed"):
-            counts[f"instances_{status}"] = self._db.value("SELECT count(*) FROM instances WHERE status = ?", (status,))
+            counts[f"instances_{status}"] = self.db.value("SELECT count(*) FROM instances WHERE status = ?", (status,))
         return counts
 
     def _next_id(self, table: str) -> int:
-        return self._db.value("SELECT coalesce(max(seq), 0) + 1 FROM sqlite_sequence WHERE name = ?", (table,))
+        return self.db.value("SELECT coalesce(max(seq), 0) + 1 FROM sqlite_sequence WHERE name = ?", (table,))
 
 
 def _trajectory_columns(rows: list[tuple]) -> dict[str, np.ndarray]:

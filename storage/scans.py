@@ -5,7 +5,8 @@ Layout: `scans/<session>/<scan_id // 1000>/<scan_id>.scan`. The bytes of a file 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import errno
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from . import scanfile
 from .errors import ScanFileError
+from .faults import naming
 from .files import make_dir, sync_dir, write_atomically
 
 SUFFIX = ".scan"
@@ -62,11 +64,16 @@ class ScanStore:
         return self.directory / str(session) / str(scan_id // IDS_PER_DIR) / f"{scan_id}{SUFFIX}"
 
     def write(self, scan: Scan) -> int:
-        """Write a scan, durably, and return the file's size in bytes. Raises OSError."""
+        """Write a scan, durably, and return the file's size in bytes. Raises StorageUnavailable, OSError."""
         data = scanfile.encode(scan)
         path = self.path(scan.session, scan.scan_id)
-        make_dir(path.parent)
-        write_atomically(path, data, self._temporary_dir)
+        with naming(path):
+            try:
+                make_dir(path.parent)
+                write_atomically(path, data, self._temporary_dir)
+            except FileNotFoundError:  # the folder was empty, and deleted by the housekeeping in this moment
+                make_dir(path.parent)
+                write_atomically(path, data, self._temporary_dir)
         return len(data)
 
     def read(self, session: int, scan_id: int) -> Scan:
@@ -81,12 +88,20 @@ class ScanStore:
             raise ScanFileError(f"{path}: holds scan {scan.scan_id} of session {scan.session}: move it back")
         return scan
 
-    def delete(self, session: int, scan_id: int) -> None:
-        """Remove a scan's file, durably. None there is no error: a crash may have come between file and index."""
-        path = self.path(session, scan_id)
-        path.unlink(missing_ok=True)
-        if path.parent.is_dir():
-            sync_dir(path.parent)
+    def delete(self, ids: Iterable[tuple[int, int]]) -> None:
+        """Remove the files of scans (session, scan_id), durably, and the folders that they leave empty.
+
+        None there is no error: a crash may have come between file and index. Raises StorageUnavailable, OSError.
+        """
+        paths = [self.path(*scan) for scan in ids]
+        with naming(self.directory):
+            for path in paths:
+                path.unlink(missing_ok=True)
+            for folder in {path.parent for path in paths}:
+                if folder.is_dir():
+                    sync_dir(folder)
+                    _remove_empty(folder)
+                    _remove_empty(folder.parent)
 
     def iter_ids(self) -> Iterator[tuple[int, int]]:
         """(session, scan_id) of every scan file, ascending, whatever the index says."""
@@ -98,20 +113,27 @@ class ScanStore:
     def highest_id(self) -> int:
         """The highest scan id on disk, 0 without any: ids above it are free, whatever the index says.
 
-        Looks at the newest folder of each session, not at all files.
+        Ids grow with sessions and with time: only the newest folder is looked at, not months of files.
         """
-        highest = 0
-        for session in _numbered(self.directory):
+        for session in reversed(_numbered(self.directory)):
             for group in reversed(_numbered(self.directory / str(session))):
                 files = _scan_files(self.directory / str(session) / str(group))
                 if files:
-                    highest = max(highest, int(files[-1].stem))
-                    break
-        return highest
+                    return int(files[-1].stem)
+        return 0
 
     @property
     def _temporary_dir(self) -> Path:
         return self.directory / "tmp"
+
+
+def _remove_empty(directory: Path) -> None:
+    """Remove a directory that holds nothing; one that does stays."""
+    try:
+        directory.rmdir()
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.ENOENT):
+            raise
 
 
 def _numbered(directory: Path) -> list[int]:

@@ -101,6 +101,24 @@ ALTER TABLE sessions ADD COLUMN continues INTEGER REFERENCES sessions (session_i
                                        -- its own map was given up. NULL: this one began with a new odometry
 """
 
+INDEX_V3 = """
+CREATE TABLE garbage (                 -- files that are to be deleted: no rows of scans any more
+    scan_id    INTEGER PRIMARY KEY,
+    session_id INTEGER NOT NULL
+) STRICT;
+CREATE TABLE usage (                   -- kept by the triggers: adding up a million scans takes too long
+    only_row   INTEGER PRIMARY KEY CHECK (only_row = 1),
+    scan_bytes INTEGER NOT NULL        -- of all scan files, each rounded up to blocks of 4096
+) STRICT;
+INSERT INTO usage SELECT 1, coalesce(sum((bytes + 4095) / 4096 * 4096), 0) FROM scans;
+CREATE TRIGGER usage_grows AFTER INSERT ON scans BEGIN
+    UPDATE usage SET scan_bytes = scan_bytes + (NEW.bytes + 4095) / 4096 * 4096;
+END;
+CREATE TRIGGER usage_shrinks AFTER DELETE ON scans BEGIN
+    UPDATE usage SET scan_bytes = scan_bytes - (OLD.bytes + 4095) / 4096 * 4096;
+END;
+"""
+
 CHANGES_V1 = """
 CREATE TABLE store (                   -- which data directory this file belongs to
     only_row        INTEGER PRIMARY KEY CHECK (only_row = 1),
@@ -200,5 +218,5 @@ SELECT o.change_id, c.polarity, o.kind AS seen_as, o.session_id, o.scene_id, o.v
 FROM observations AS o JOIN changes AS c ON c.id = o.change_id ORDER BY o.observation_id;
 """
 
-INDEX_MIGRATIONS = (INDEX_V1, INDEX_V2)
+INDEX_MIGRATIONS = (INDEX_V1, INDEX_V2, INDEX_V3)
 CHANGES_MIGRATIONS = (CHANGES_V1, CHANGES_V2)

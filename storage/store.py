@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from .changes import ChangeStore
 from .datadir import DataDir
 from .index import IndexStore
+from .retention import Retention, finish_garbage
 from .scans import Scan, ScanStore
 
 
@@ -17,6 +19,7 @@ class Store:
 
     def __init__(self, data_dir: DataDir, scans: ScanStore, index: IndexStore, changes: ChangeStore):
         self.dir, self.scans, self.index, self.changes = data_dir, scans, index, changes
+        self.grown = threading.Event()  # set by each scan, for whoever keeps the quota
 
     @classmethod
     def open_writer(cls, path: Path) -> Store:
@@ -32,6 +35,8 @@ class Store:
             index = IndexStore.open_writer(data_dir.index_path, data_dir.uuid)
             opened.callback(index.close)
             changes = ChangeStore.open_writer(data_dir.changes_path, data_dir.uuid)
+            opened.callback(changes.close)
+            finish_garbage(index.db, scans)
             opened.pop_all()
         store = cls(data_dir, scans, index, changes)
         store._next_scan_id = max(index.next_scan_id(), scans.highest_id() + 1)
@@ -56,12 +61,26 @@ class Store:
 
     def add_scan(self, scan: Scan, visit_ids: Iterable[int] = ()) -> None:
         """Store a key scan: first its file, then its row with its place in the visits. A crash in between
-        leaves a file that the index does not know; nothing is ever in the index without its file."""
+        leaves a file that the index does not know; nothing is ever in the index without its file.
+
+        Raises StorageUnavailable (disk full, read-only, index locked) with nothing stored.
+        """
         n_bytes = self.scans.write(scan)
-        with self.index.transaction():
-            self.index.add_scan(scan, n_bytes)
-            for visit_id in visit_ids:
-                self.index.add_visit_scans(visit_id, [scan.scan_id])
+        try:
+            with self.index.transaction():
+                self.index.add_scan(scan, n_bytes)
+                for visit_id in visit_ids:
+                    self.index.add_visit_scans(visit_id, [scan.scan_id])
+        except BaseException:
+            self.scans.delete([(scan.session, scan.scan_id)])
+            raise
+        self.grown.set()
+
+    def retention(self, *, quota_bytes: int, min_free_bytes: int, kept_per_visit: int, recent_ns: int) -> Retention:
+        """What keeps this directory within its quota, step by step: see retention.py."""
+        limits = {"quota_bytes": quota_bytes, "min_free_bytes": min_free_bytes}
+        kept = {"kept_per_visit": kept_per_visit, "recent_ns": recent_ns}
+        return Retention(self.dir, self.scans, self.index.db, **limits, **kept)
 
     def close(self) -> None:
         self.changes.close()

@@ -74,3 +74,21 @@ def make_change(polarity="appeared", at=(0.0, 0.0, 0.0), n_points=50, **fields):
         "config_digest": "abcdef012345",
     }
     return Change(**{**values, **fields})
+
+
+def add_visit(store, scene, number, session, n_scans, at=(0.0, 0.0), step_m=0.5, first_ns=0, after_each=None, **fields):
+    """A visit of some scans in a row along x, with their files; the ids. The scene is made with its first visit."""
+    if number == 1:
+        store.index.add_scene(scene, session, np.array([at]), 2.5, 20.0)
+    stamps = [first_ns + i * 500_000_000 for i in range(n_scans)]
+    visit = store.index.open_visit(scene, number, session, stamps[0])
+    ids = []
+    for i, stamp_ns in enumerate(stamps):
+        T_map_sensor = pose(at[0] + step_m * i, at[1])
+        scan = make_scan(store.new_scan_id(), session, T_map_sensor=T_map_sensor, stamp_ns=stamp_ns, **fields)
+        store.add_scan(scan, [visit])
+        ids.append(scan.scan_id)
+        if after_each is not None:
+            after_each(scan.scan_id)
+    store.index.close_visit(visit, stamps[-1])
+    return ids

@@ -89,7 +89,7 @@ def test_a_file_that_is_no_database_is_named(tmp_path, name):
     Store.open_writer(tmp_path).close()
     (tmp_path / name).write_bytes(b"this is not a database, it is a text of some length" * 100)
     for opening in (Store.open_writer, Store.open_reader):
-        with pytest.raises(DatabaseFileError, match=f"{name}: cannot be opened as a database"):
+        with pytest.raises(DatabaseFileError, match=f"{name}: not a database"):
             opening(tmp_path)
 
 
@@ -182,7 +182,6 @@ def test_scan_ids_go_on_after_a_restart_and_deleted_ids_are_not_used_again(tmp_p
         ids = [store.new_scan_id() for _ in range(3)]
         for scan_id in ids:
             store.add_scan(make_scan(scan_id, session))
-    for session, scan_id in list(store.scans.iter_ids()):
-        store.scans.delete(session, scan_id)
+    store.scans.delete(list(store.scans.iter_ids()))
     with Store.open_writer(tmp_path) as store:
         assert store.new_scan_id() > max(ids)

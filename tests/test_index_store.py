@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from stored import SESSION, make_scan, pose
 
+from revisitd.storage.errors import StorageReadOnly
 from revisitd.storage.index import IndexStore
 from revisitd.storage.rows import InstanceRow
 from revisitd.storage.schema import CHANGES_MIGRATIONS, INDEX_MIGRATIONS
@@ -251,6 +252,6 @@ def test_an_index_of_every_past_version_opens(path, version):
 
 def test_a_reader_cannot_write(index, session, path):
     reader = IndexStore.open_reader(path)
-    with pytest.raises(sqlite3.OperationalError, match="readonly"):
+    with pytest.raises(StorageReadOnly, match="read-only"):
         reader.start_session(**SESSION)
     reader.close()

@@ -8,7 +8,7 @@ import pytest
 from stored import make_scan
 
 from revisitd.storage import scanfile
-from revisitd.storage.errors import ScanFileError
+from revisitd.storage.errors import ScanFileError, StorageFull
 from revisitd.storage.scans import ScanStore
 
 
@@ -132,8 +132,8 @@ def test_a_file_moved_to_another_id_is_noticed(store):
 
 def test_a_deleted_scan_is_gone_and_deleting_it_again_is_no_error(store):
     store.write(make_scan(7))
-    store.delete(1, 7)
-    store.delete(1, 7)
+    store.delete([(1, 7)])
+    store.delete([(1, 7)])
     assert list(store.iter_ids()) == []
 
 
@@ -158,7 +158,7 @@ def test_a_failed_write_leaves_nothing_behind(store, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(StorageFull, match=r"7\.scan: no space left"):
         store.write(make_scan(7))
     monkeypatch.undo()
     assert list(store.iter_ids()) == []

@@ -66,12 +66,12 @@ def find_scenes_again(data: Path, config: Config) -> None:
 
 def instances_of(store: Store) -> list[Instance]:
     """Every visit but the scenes' first ones, in the order in which they ended."""
-    return [Instance(*row) for row in store.index._db.tuples(VISITS)]
+    return [Instance(*row) for row in store.index.db.tuples(VISITS)]
 
 
 def model_of(store: Store) -> str:
     """The id of the model that described the scans."""
-    return store.index._db.value("SELECT model_id FROM descriptors LIMIT 1")
+    return store.index.db.value("SELECT model_id FROM descriptors LIMIT 1")
 
 
 def detection_on(store: Store, config: Config) -> ChangeDetection:
@@ -85,5 +85,5 @@ def detect_again(data: Path, config: Config) -> list[tuple[float, int]]:
         detection, instances = detection_on(store, config), instances_of(store)
         for instance in instances:
             detection.run(instance)
-        done = dict(store.index._db.tuples("SELECT visit_id, seconds FROM instances WHERE status = 'done'"))
+        done = dict(store.index.db.tuples("SELECT visit_id, seconds FROM instances WHERE status = 'done'"))
     return [(done[i.visit_id], i.t_out_ns) for i in instances if i.visit_id in done]
