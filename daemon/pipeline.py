@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from ..drivers.frame import Frame
-from ..drivers.gate import FrameGate, Rejection
+from ..drivers.gate import FrameGate
 from ..models.descriptor import DescriptorModel
 from ..storage.scans import Scan
 from ..storage.store import Store
@@ -31,8 +31,6 @@ from .views import OWN_BODY_M
 from .worker import DetectionWorker
 
 logger = logging.getLogger(__name__)
-
-CLOCK_RESET_FRAMES = 5  # half a second of frames from the past is no reordering of packets
 
 
 @dataclass
@@ -70,16 +68,17 @@ class Pipeline:
         self._source, self._wait = source, wait
         self._session: Session | None = None
         self._joiner: Joiner | None = None  # of a session in a map of its own
-        self._clock_back = 0  # frames in a row whose time was not after the last accepted one
 
     def process(self, frame: Frame) -> None:
         """One rotation of the sensor."""
         self.counts.frames += 1
         rejection = self.gate.check(frame)
+        if self.gate.interruption:
+            logger.warning("a new session begins: %s", self.gate.interruption)
+            self.finish()
         if rejection is not None:
-            self._reject(rejection)
+            self.counts.rejected += 1
             return
-        self._clock_back = 0
         session = self._session or self._start_session(frame)
         motion = session.odometry.register(frame)
         if motion.health.lost:
@@ -93,15 +92,6 @@ class Pipeline:
             self._note(self._session, self._session.scenes.finish())
             self._store.index.end_session(self._session.session_id)
             self._session = None
-
-    def _reject(self, rejection: Rejection) -> None:
-        """A late frame is skipped; a clock that stays back was reset (reboot, looped capture): a session of its own."""
-        self.counts.rejected += 1
-        self._clock_back = self._clock_back + 1 if rejection is Rejection.TIME_NOT_INCREASING else 0
-        if self._clock_back == CLOCK_RESET_FRAMES:
-            logger.warning("the sensor's clock began anew")
-            self.finish()
-            self.gate.restart()
 
     def _keep(self, session: Session, frame: Frame, motion: Motion) -> None:
         """A key scan: find where it is, describe it, store it, and tell the scenes."""
