@@ -10,7 +10,6 @@ from pathlib import Path
 
 from .. import __version__
 from ..drivers.kept import KeptSource
-from .config import Config
 from .metrics import METRICS_FILE, write_metrics
 from .notify import notify
 from .pipeline import Now
@@ -36,8 +35,8 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 class StatusBoard:
     """Called from the frame loop; writes once a second, and costs a millisecond then."""
 
-    def __init__(self, data: Path, program: Program, source: KeptSource, config: Config):
-        self._data, self._program, self._source, self._config = data, program, source, config
+    def __init__(self, data: Path, program: Program, source: KeptSource, address: str):
+        self._data, self._program, self._source, self._address = data, program, source, address
         self._path = status_path(data)
         self._started_ns = time.time_ns()
         self._shown = 0.0
@@ -97,8 +96,7 @@ class StatusBoard:
                 "mode": sensor.mode,
                 "clock": sensor.timestamp_mode,
             }
-        address = self._config.sensor.address
-        return SensorStatus(address, state.phase, state.problem, state.since_ns, state.n_opened, **known)
+        return SensorStatus(self._address, state.phase, state.problem, state.since_ns, state.n_opened, **known)
 
     def _frames(self) -> FrameStatus:
         counts, gate = self._program.pipeline.counts, self._program.pipeline.gate
@@ -149,7 +147,7 @@ class StatusBoard:
         return StoreStatus(
             data=str(self._data.resolve()),
             used_bytes=figures.used_bytes,
-            quota_bytes=round(self._config.storage.quota_gb * 1e9),
+            quota_bytes=figures.quota_bytes,
             free_bytes=figures.free_bytes,
             scans=figures.scans,
             scans_deleted=figures.scans_deleted,

@@ -9,7 +9,7 @@ import click
 from .. import __version__
 from ..drivers.errors import BadCapture, BadMetadata, DriverError, SensorUnavailable, SourceNotFound
 from ..storage.errors import NewerFormat, StorageError
-from .commands import results, service, settings, sources
+from .commands import emulator, results, service, settings, sources
 from .config import ConfigError
 from .install import InstallError
 from .notify import log_handler
@@ -75,6 +75,7 @@ for command in (
     results.trajectory,
     results.plot,
     sources.simulate,
+    emulator.emulate,
     settings.dump_config_,
     settings.check_config,
     service.doctor,

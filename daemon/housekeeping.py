@@ -27,6 +27,7 @@ class Figures:
     """What the store holds, as of the last look."""
 
     used_bytes: int = 0
+    quota_bytes: int = 0
     free_bytes: int = 0
     scans: int = 0
     scans_deleted: int = 0  # since the start
@@ -95,6 +96,7 @@ class Housekeeping:
             self.figures = replace(
                 self.figures,
                 used_bytes=report.used_bytes,
+                quota_bytes=round(self._config.quota_gb * 1e9),
                 free_bytes=report.free_bytes,
                 scans_deleted=self.figures.scans_deleted + report.n_deleted,
             )

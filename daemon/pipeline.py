@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from ..drivers.frame import Frame
-from ..drivers.gate import FrameGate, Rejection
+from ..drivers.gate import FrameGate
 from ..models.descriptor import DescriptorModel
 from ..storage.rows import InstanceRow
 from ..storage.scans import Scan
@@ -32,8 +32,6 @@ from .views import OWN_BODY_M
 from .worker import DetectionWorker
 
 logger = logging.getLogger(__name__)
-
-CLOCK_RESET_FRAMES = 5  # half a second of frames from the past is no reordering of packets
 
 
 @dataclass
@@ -83,19 +81,17 @@ class Pipeline:
         self._session: Session | None = None
         self._joiner: Joiner | None = None  # of a session in a map of its own
         self._health = Health.GOOD
-        self._clock_back = 0  # frames in a row whose time was not after the last accepted one
 
     def process(self, frame: Frame) -> None:
         """One rotation of the sensor."""
         self.counts.frames += 1
-        if self._session is not None and not self._session.is_of(frame.sensor):
-            logger.warning("the sensor was restarted, changed or replaced: a new session begins")
-            self._begin_anew()
         rejection = self.gate.check(frame)
+        if self.gate.interruption:
+            logger.warning("a new session begins: %s", self.gate.interruption)
+            self.finish()
         if rejection is not None:
-            self._reject(rejection)
+            self.counts.rejected += 1
             return
-        self._clock_back = 0
         session = self._session or self._start_session(frame)
         motion = session.odometry.register(frame)
         self._health = motion.health
@@ -117,19 +113,6 @@ class Pipeline:
         if session is None:
             return None
         return Now(session.session_id, session.map_id, tuple(sorted(session.scenes.open_visits)), self._health)
-
-    def _reject(self, rejection: Rejection) -> None:
-        """A late frame is skipped; a clock that stays back was reset (reboot, looped capture): a session of its own."""
-        self.counts.rejected += 1
-        self._clock_back = self._clock_back + 1 if rejection is Rejection.TIME_NOT_INCREASING else 0
-        if self._clock_back == CLOCK_RESET_FRAMES:
-            logger.warning("the sensor's clock began anew")
-            self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        """What comes next has nothing to do with what was before: not its clock, not its odometry."""
-        self.finish()
-        self.gate.restart()
 
     def _keep(self, session: Session, frame: Frame, motion: Motion) -> None:
         """A key scan: find where it is, describe it, store it, and tell the scenes."""

@@ -39,7 +39,7 @@ class Service:
         address = self._config.sensor.address
         with Program(self._data, self._config, address, wait=False) as program:
             source = KeptSource(address, self._config.sensor.wish, self._stop)
-            board = StatusBoard(self._data, program, source, self._config)
+            board = StatusBoard(self._data, program, source, address)
             notify("READY=1")
             logger.info("revisitd serves %s, data in %s", address, self._data)
             self._loop(program, source, board)

@@ -60,11 +60,6 @@ class Session:
         known = [Scene(row.scene_id, row.hull, row.n_visits) for row in store.index.scenes(self.map_id)]
         self.scenes = SceneTracker(config.scenes, known, store.index.next_scene_id())
 
-    def is_of(self, sensor: Sensor) -> bool:
-        """Whether it is this session's sensor, with the geometry and the clock that it had."""
-        ours = self._sensor
-        return (sensor.digest, sensor.init_id, sensor.serial) == (ours.digest, ours.init_id, ours.serial)
-
     def joined(self, join: Join) -> Session:
         """The session that goes on from this one, which has ended, in an earlier map: the same odometry, no break."""
         return Session(self._config, self._store, self._sensors, self._sensor, self._source, join, self)

@@ -85,6 +85,11 @@ class Frame:
         return int(self.column_ns[self.column_valid].max())
 
     @property
+    def clock_offset_ns(self) -> int:
+        """The host's clock less the sensor's, ns; it contains the packet's way here."""
+        return self.host_ns - self.stamp_ns
+
+    @property
     def valid_ratio(self) -> float:
         """Valid columns over the columns of the sensor's window, 0..1."""
         window = self.sensor.in_window

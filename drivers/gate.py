@@ -5,6 +5,7 @@ from enum import Enum
 
 import numpy as np
 
+from .clock import ClockWatch, Course
 from .errors import BadCapture
 from .frame import Frame
 
@@ -19,6 +20,7 @@ class Rejection(str, Enum):
 
     TOO_FEW_COLUMNS = "too few columns"
     TIME_DAMAGED = "column times damaged"
+    TIME_DOUBTFUL = "time beside the frames before"
     TIME_NOT_INCREASING = "time not increasing"
     NO_RETURNS = "no returns"
 
@@ -33,6 +35,8 @@ class FrameGate:
         self._min_valid_ratio = min_valid_ratio
         self._last_stamp_ns: int | None = None
         self._last_frame_id: int | None = None
+        self._clock = ClockWatch()
+        self.interruption = ""  # why the frame last checked begins a time of its own; empty where it goes on
         self.accepted = 0
         self.rejected: Counter = Counter()  # Rejection -> frames
         self.frames_missing = 0  # of which no column arrived
@@ -45,7 +49,12 @@ class FrameGate:
         return missing | {f"frames rejected: {reason}": count for reason, count in self.rejected.items()}
 
     def check(self, frame: Frame) -> Rejection | None:
-        """None where the frame is good, else why it is not. Call once for each frame, in order."""
+        """None where the frame is good, else why it is not. Call once for each frame, in order.
+
+        Sets `interruption` where nothing may be carried over from the frames before: the sensor's clock stepped, it
+        was restarted, or it is another one.
+        """
+        self.interruption = ""
         self._count_missing(frame)
         rejection = self._judge(frame)
         if rejection:
@@ -54,10 +63,6 @@ class FrameGate:
             self.accepted += 1
             self._last_stamp_ns = frame.stamp_ns
         return rejection
-
-    def restart(self) -> None:
-        """Forget the last frame: the sensor's clock began anew. What was counted stays."""
-        self._last_stamp_ns = self._last_frame_id = None
 
     def require_accepted(self, source: str) -> None:
         """Raises BadCapture where no frame of the source has been accepted, once it is read to its end."""
@@ -73,8 +78,13 @@ class FrameGate:
             return Rejection.TOO_FEW_COLUMNS
         if np.ptp(frame.column_ns[frame.column_valid]) > MAX_SPAN_PERIODS * frame.sensor.frame_period_ns:
             return Rejection.TIME_DAMAGED  # before it becomes the time that all later frames are held against
+        course = self._clock.check(frame)
+        if course is Course.BROKEN:
+            self.interruption, self._last_stamp_ns = self._clock.reason, None
         if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
             return Rejection.TIME_NOT_INCREASING
+        if course is Course.DOUBTFUL:
+            return Rejection.TIME_DOUBTFUL
         if np.count_nonzero(frame.range_mm >= NEAREST_MM) < MIN_RETURN_RATIO * frame.range_mm.size:
             return Rejection.NO_RETURNS
         return None

@@ -16,6 +16,7 @@ from .frame import Frame, Sensor
 from .live import LiveSource
 from .sensor_http import SensorHttp
 from .sensor_setup import SensorWish, require_unchanged
+from .telemetry import Telemetry, TelemetryPoller
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +69,12 @@ class KeptSource:
         self._first_delay_s, self._longest_delay_s, self._silence_s = first_delay_s, longest_delay_s, silence_s
         self.losses: Counter = Counter()  # Loss -> how often, over all openings
         self.state = SensorState(Phase.CONNECTING, "", time.time_ns(), 0, None)
+        self._telemetry = TelemetryPoller(SensorHttp(address), self._is_open, stop)
+
+    @property
+    def telemetry(self) -> Telemetry | None:
+        """The sensor's health as it told it last; None while it is not open."""
+        return self._telemetry.latest
 
     def __iter__(self) -> Iterator[Frame | None]:
         delay_s = self._first_delay_s
@@ -122,6 +129,9 @@ class KeptSource:
             self._first_delay_s,
             self._longest_delay_s,
         )
+
+    def _is_open(self) -> bool:
+        return self.state.phase in (Phase.RUNNING, Phase.SILENT)
 
     def _wait(self, delay_s: float) -> Iterator[None]:
         until = time.monotonic() + delay_s

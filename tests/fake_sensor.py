@@ -16,6 +16,7 @@ class FakeSensor:
 
     def __init__(self, document: dict):
         self.document = document
+        self.others: dict[str, object] = {}  # path -> what else is answered
         self.requests: list[tuple[str, str]] = []
         self.set: list[dict] = []
         self.accepts = True
@@ -24,7 +25,7 @@ class FakeSensor:
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self):
                 fake.requests.append(("GET", self.path))
-                fake.answer(self, fake.document if self.path == METADATA else None)
+                fake.answer(self, fake.document if self.path == METADATA else fake.others.get(self.path))
 
             def do_POST(self):
                 fake.requests.append(("POST", self.path))
