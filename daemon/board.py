@@ -87,6 +87,7 @@ class StatusBoard:
 
     def _sensor(self) -> SensorStatus:
         state, sensor, known = self._source.state, self._source.state.sensor, {}
+        telemetry = self._source.telemetry
         if sensor is not None:
             known = {
                 "serial": sensor.serial,
@@ -95,6 +96,12 @@ class StatusBoard:
                 "profile": sensor.profile,
                 "mode": sensor.mode,
                 "clock": sensor.timestamp_mode,
+            }
+        if telemetry is not None:
+            known |= {
+                "temperature_c": telemetry.temperature_c,
+                "alerts": telemetry.alerts,
+                "clock_synced": telemetry.clock_synced,
             }
         return SensorStatus(self._address, state.phase, state.problem, state.since_ns, state.n_opened, **known)
 
@@ -149,6 +156,7 @@ class StatusBoard:
             used_bytes=figures.used_bytes,
             quota_bytes=figures.quota_bytes,
             free_bytes=figures.free_bytes,
+            problem=self._program.pipeline.disk_problem,
             scans=figures.scans,
             scans_deleted=figures.scans_deleted,
             memory_bytes=_resident_bytes("self"),
@@ -170,8 +178,8 @@ def _line(
         return "waiting", f"no usable frame yet, {figures}"
     if place.odometry != "good":
         return "lost", f"odometry lost ({place.odometry}), {figures}"
-    if sensor.problem:
-        return "degraded", f"{sensor.problem}, {figures}"
+    if sensor.problem or store.problem:
+        return "degraded", f"{sensor.problem or store.problem}, {figures}"
     return "running", f"good {figures}"
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from ..drivers.frame import Frame
 from ..drivers.gate import FrameGate
 from ..models.descriptor import DescriptorModel
+from ..storage.errors import StorageUnavailable
 from ..storage.rows import InstanceRow
 from ..storage.scans import Scan
 from ..storage.store import Store
@@ -81,6 +82,7 @@ class Pipeline:
         self._session: Session | None = None
         self._joiner: Joiner | None = None  # of a session in a map of its own
         self._health = Health.GOOD
+        self.disk_problem = ""  # why the last key scan was not stored; empty where it was
 
     def process(self, frame: Frame) -> None:
         """One rotation of the sensor."""
@@ -92,6 +94,13 @@ class Pipeline:
         if rejection is not None:
             self.counts.rejected += 1
             return
+        try:
+            self._follow(frame)
+        except StorageUnavailable as error:
+            self._do_without(error)
+
+    def _follow(self, frame: Frame) -> None:
+        """Find where the robot is, and keep the frame if it shows something new. Raises StorageUnavailable."""
         session = self._session or self._start_session(frame)
         motion = session.odometry.register(frame)
         self._health = motion.health
@@ -102,10 +111,14 @@ class Pipeline:
 
     def finish(self) -> None:
         """The source has ended: close the scene being made and the visits, and queue what is due."""
-        if self._session is not None:
+        if self._session is None:
+            return
+        try:
             self._note(self._session, self._session.scenes.finish())
             self._store.index.end_session(self._session.session_id)
-            self._session = None
+        except StorageUnavailable as error:
+            self._do_without(error)
+        self._session = None
 
     def now(self) -> Now | None:
         """The session at hand; None between two."""
@@ -125,12 +138,22 @@ class Pipeline:
         scan = self._scan(session, frame, motion, fix)
         self._store.add_scan(scan)
         self.counts.key_scans += 1
+        if self.disk_problem:
+            logger.info("key scans are stored again")
+            self.disk_problem = ""
         self._note(
             session, session.scenes.update(scan.scan_id, scan.stamp_ns, fix.T_map_sensor[:2, 3], scan.descriptor)
         )
         join = self._joiner.update(scan) if self._joiner is not None else None
         if join is not None:
             self._go_on_in(join, session)
+
+    def _do_without(self, error: StorageUnavailable) -> None:
+        """The disk is full, or fails, or somebody holds a database: a robot drives on, and so does its odometry."""
+        self.counts.not_stored += 1
+        if str(error) != self.disk_problem:
+            logger.warning("a key scan was not stored: %s", error)
+        self.disk_problem = str(error)
 
     def _scan(self, session: Session, frame: Frame, motion: Motion, fix: Fix) -> Scan:
         sensor = frame.sensor

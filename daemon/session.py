@@ -58,6 +58,7 @@ class Session:
         T_map_odom = join.T_map_odom if join else np.eye(4)
         self.localizer = Localizer(config.alignment, self._load_reference, T_map_odom)
         known = [Scene(row.scene_id, row.hull, row.n_visits) for row in store.index.scenes(self.map_id)]
+        self._unrecorded: list[SceneUpdate] = []  # what the disk has not taken yet
         self.scenes = SceneTracker(config.scenes, known, store.index.next_scene_id())
 
     def joined(self, join: Join) -> Session:
@@ -72,20 +73,31 @@ class Session:
         return [scene for scene in near if scene.scene_id not in being_made]
 
     def record(self, update: SceneUpdate) -> list[Instance]:
-        """Store what a key scan did to the scenes; the instances that are due: each visit but a scene's first."""
+        """Store what a key scan did to the scenes; the instances that are due: each visit but a scene's first.
+
+        Raises StorageUnavailable; what could not be stored is stored with the next one.
+        """
+        if update.new_scene is not None or update.ended_visits:
+            self._unrecorded.append(update)
+        if not self._unrecorded:
+            return []
+        with self._store.index.transaction():
+            due = [instance for waiting in self._unrecorded for instance in self._record(waiting)]
+        self._unrecorded.clear()
+        return due
+
+    def _record(self, update: SceneUpdate) -> list[Instance]:
         index, due = self._store.index, []
-        with index.transaction():
-            if update.new_scene is not None:
-                hull, margin = update.new_scene.hull, self._config.scenes.margin_m
-                area = grown_area_m2(hull, margin)
-                index.add_scene(update.new_scene.scene_id, self.map_id, hull, margin, area)
-            for visit in update.ended_visits:
-                visit_id = index.open_visit(visit.scene_id, visit.number, self.session_id, visit.t_in_ns)
-                index.add_visit_scans(visit_id, visit.scan_ids)
-                index.close_visit(visit_id, visit.t_out_ns)
-                if visit.number >= 2:
-                    where = (self.session_id, self.map_id, visit.scene_id, visit_id, visit.number)
-                    due.append(Instance(*where, visit.t_in_ns, visit.t_out_ns))
+        if update.new_scene is not None:
+            hull, margin = update.new_scene.hull, self._config.scenes.margin_m
+            index.add_scene(update.new_scene.scene_id, self.map_id, hull, margin, grown_area_m2(hull, margin))
+        for visit in update.ended_visits:
+            visit_id = index.open_visit(visit.scene_id, visit.number, self.session_id, visit.t_in_ns)
+            index.add_visit_scans(visit_id, visit.scan_ids)
+            index.close_visit(visit_id, visit.t_out_ns)
+            if visit.number >= 2:
+                where = (self.session_id, self.map_id, visit.scene_id, visit_id, visit.number)
+                due.append(Instance(*where, visit.t_in_ns, visit.t_out_ns))
         return due
 
     def _load_reference(self, scene: Scene) -> np.ndarray:

@@ -34,7 +34,8 @@ class SensorStatus:
     firmware: str = ""
     profile: str = ""
     mode: str = ""
-    clock: str = ""
+    clock: str = ""  # what it follows
+    clock_synced: bool | None = None  # None: it follows nothing, or does not say
     temperature_c: float | None = None
     alerts: tuple[str, ...] = ()
 
@@ -87,6 +88,7 @@ class StoreStatus:
     free_bytes: int
     scans: int
     scans_deleted: int  # by retention, since the start
+    problem: str  # why key scans are not stored; empty where they are
     memory_bytes: int  # resident, of this process
     detection_memory_bytes: int  # resident, of the detection process
 
@@ -154,7 +156,7 @@ def status_table(status: dict) -> str:
         ("sensor", f"{sensor['address']}: {sensor['phase']}" + (f", {kind}" if kind else "")),
         ("problem", sensor["problem"]),
         ("alerts", "; ".join(sensor["alerts"])),
-        ("clock", sensor["clock"]),
+        ("clock", sensor["clock"] + ("" if sensor["clock_synced"] in (True, None) else ", NOT synchronised")),
         ("frames", f"{frames['hz']:.1f} Hz, {frames['received']} received, {frames['rejected']} rejected"),
         ("lost", f"{lost}; {frames['lost_share']:.2%} of the last seconds' columns"),
         ("odometry", f"{place['odometry']}, lost {place['times_lost']} times"),
@@ -171,6 +173,7 @@ def status_table(status: dict) -> str:
             f"{store['data']}: {_gigabytes(store['used_bytes'])} of {_gigabytes(store['quota_bytes'])} used, "
             f"{_gigabytes(store['free_bytes'])} free, {store['scans']} scans, {store['scans_deleted']} removed",
         ),
+        ("not stored", f"{frames['not_stored']} key scans: {store['problem']}" if frames["not_stored"] else ""),
         ("memory", f"{store['memory_bytes'] >> 20} + {store['detection_memory_bytes'] >> 20} MiB"),
         ("model", status["model_id"]),
         ("settings", status["settings"]),

@@ -210,6 +210,10 @@ class ChangeStore:
         where = " AND ".join(sql for sql, _ in terms)
         return self._select(where, [value for _, values in terms for value in values], with_points)
 
+    def count_present(self) -> int:
+        """Changes that hold."""
+        return self._db.value("SELECT count(*) FROM changes WHERE state = 'present'")
+
     def publish_change_list(self, n: int) -> list[ChangeObject]:
         """Metadata of all changes of at least n points, without the points (CDSD section III-D)."""
         return self.changes(min_points=n, with_points=False)

@@ -173,7 +173,7 @@ class IndexStore:
 
     def count_scans(self) -> int:
         """Key scans in the store."""
-        return self.connection.value("SELECT count(*) FROM scans")
+        return self.db.value("SELECT count(*) FROM scans")
 
     # Scenes and visits --------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class IndexStore:
 
     def visits_due(self) -> list[DueVisit]:
         """Visits that were to be compared and of which no instance is recorded, oldest first."""
-        rows = self._db.rows(
+        rows = self.db.rows(
             """SELECT v.session_id, s.map_id, v.scene_id, v.visit_id, v.number AS visit, v.t_in_ns, v.t_out_ns
                FROM visits AS v JOIN scenes AS s USING (scene_id)
                WHERE v.number >= 2 AND v.t_out_ns IS NOT NULL
