@@ -156,7 +156,7 @@ class StatusBoard:
             used_bytes=figures.used_bytes,
             quota_bytes=figures.quota_bytes,
             free_bytes=figures.free_bytes,
-            problem=self._program.pipeline.disk_problem,
+            problem=self._program.pipeline.disk_problem or figures.problem,
             scans=figures.scans,
             scans_deleted=figures.scans_deleted,
             memory_bytes=_resident_bytes("self"),

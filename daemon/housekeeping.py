@@ -32,6 +32,7 @@ class Figures:
     scans: int = 0
     scans_deleted: int = 0  # since the start
     present_changes: int = 0
+    problem: str = ""  # why the limits are not kept, or what had to go
 
 
 class Housekeeping:
@@ -99,6 +100,7 @@ class Housekeeping:
                 quota_bytes=round(self._config.quota_gb * 1e9),
                 free_bytes=report.free_bytes,
                 scans_deleted=self.figures.scans_deleted + report.n_deleted,
+                problem=report.problem,
             )
             if report.problem:
                 self._say(report.problem)

@@ -152,4 +152,10 @@ def _log(found: DetectedObject, instance: Instance) -> None:
     logger.info(
         "change %s at x=%.1f y=%.1f z=%.1f points=%d scene=%d visit=%d",
         found.polarity, x, y, z, len(found.points), instance.scene_id, instance.visit,
+        extra={  # fields of the journal
+            "POLARITY": found.polarity,
+            "SESSION": instance.session_id,
+            "SCENE": instance.scene_id,
+            "VISIT": instance.visit,
+        },
     )  # fmt: skip

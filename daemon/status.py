@@ -88,7 +88,7 @@ class StoreStatus:
     free_bytes: int
     scans: int
     scans_deleted: int  # by retention, since the start
-    problem: str  # why key scans are not stored; empty where they are
+    problem: str  # why key scans are not stored, or the quota is not kept; empty where all is well
     memory_bytes: int  # resident, of this process
     detection_memory_bytes: int  # resident, of the detection process
 
@@ -173,7 +173,8 @@ def status_table(status: dict) -> str:
             f"{store['data']}: {_gigabytes(store['used_bytes'])} of {_gigabytes(store['quota_bytes'])} used, "
             f"{_gigabytes(store['free_bytes'])} free, {store['scans']} scans, {store['scans_deleted']} removed",
         ),
-        ("not stored", f"{frames['not_stored']} key scans: {store['problem']}" if frames["not_stored"] else ""),
+        ("not stored", f"{frames['not_stored']} key scans" if frames["not_stored"] else ""),
+        ("", store["problem"]),
         ("memory", f"{store['memory_bytes'] >> 20} + {store['detection_memory_bytes'] >> 20} MiB"),
         ("model", status["model_id"]),
         ("settings", status["settings"]),

@@ -79,7 +79,7 @@ def test_the_housekeeping_backs_up_and_keeps_the_quota_until_it_is_closed(store)
     config = Config(storage=StorageConfig(quota_gb=10.0))
     with Housekeeping(store, config) as housekeeping:
         deadline = time.monotonic() + 20.0
-        while not (backups(store.dir) and housekeeping.report) and time.monotonic() < deadline:
+        while not (backups(store.dir) and housekeeping.figures.used_bytes) and time.monotonic() < deadline:
             time.sleep(0.01)
     assert len(backups(store.dir)) == 1
-    assert housekeeping.report.problem == ""
+    assert housekeeping.figures.problem == ""
