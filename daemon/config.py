@@ -94,7 +94,7 @@ class OdometryConfig(_Section):
     max_speed_mps: float = Field(20.0, gt=0, description="faster is not believed: odometry is lost")
     max_turn_dps: float = Field(270.0, gt=0, description="turning faster is not believed: odometry is lost")
     min_overlap: float = Field(
-        0.4, ge=0, le=1, description="share of a scan that must lie on the local map; below: odometry is lost"
+        0.4, ge=0, le=1, description="share of what stands that must have stood a frame ago; below: odometry is lost"
     )
 
 

@@ -23,8 +23,13 @@ from kiss_icp.config import KISSConfig  # noqa: E402
 from kiss_icp.kiss_icp import KissICP  # noqa: E402
 
 MIN_POINTS = 1000  # fewer registrable returns than this say nothing about a pose
-CHECK_EVERY = 5  # frames between two looks at the overlap (30 ms each)
-OVERLAP_SAMPLE = 1000
+# What stands is what tells a place: on flat ground every scan lies on every other. Of two scans a frame apart 84 % and
+# more of it agree, of scans of two places 31 % at most (studied on five virtual worlds).
+STANDING_M = 0.5  # above the lower quartile of a scan's heights
+STANDING_RANGE_M = 30.0
+AGREES_M = 0.5
+MIN_STANDING = 100  # points; with fewer nothing can be told
+STANDING_SAMPLE = 1000
 MAX_GAP_FRAMES = 5.0  # 0.5 s at 10 Hz: beyond, the constant-velocity guess is no longer near the truth
 SPANS = (1, 3, 5)  # frames over which the motion may be smoothed
 FORGET = 0.1  # what the last frame weighs in the choice between them
@@ -36,7 +41,7 @@ class Health(str, Enum):
     GOOD = "good"
     LOST_TOO_FEW_RETURNS = "too few returns"
     LOST_IMPLAUSIBLE_MOTION = "implausible motion"
-    LOST_NO_OVERLAP = "scan does not lie on the local map"
+    LOST_NO_OVERLAP = "another place than a frame ago"
     LOST_GAP = "frames missing"
 
     @property
@@ -104,6 +109,7 @@ class Odometry:
         kiss.registration.convergence_criterion = 1e-3
         self._kiss = KissICP(kiss)
         self._steady = SteadyMotion()
+        self._standing = np.empty((0, 3))  # of the last frame, in the odometry's frame
         self._stamp_ns: int | None = None
         self._frames = 0
 
@@ -118,17 +124,16 @@ class Odometry:
             return Motion(previous, np.eye(4), Health.LOST_GAP)
         # KISS-ICP's constant-velocity guess is its last step, and assumes one period between frames.
         self._kiss.last_delta = self._steady.during(gap_frames)
-        map_before = self._kiss.local_map.point_cloud() if self._frames % CHECK_EVERY == CHECK_EVERY - 1 else None
         self._kiss.register_frame(points, times)
         T_odom_sensor = self._kiss.last_pose.copy()
         motion = inverse(previous) @ T_odom_sensor if self._frames else np.eye(4)
         if self._frames:
             self._steady.add(motion, gap_frames)
         health = self._verdict(motion, gap_frames * frame.sensor.frame_period_ns * 1e-9)
-        if health is Health.GOOD and map_before is not None:
-            # Against the map without this scan: on the one with it every scan lies.
-            if self._overlap(points, map_before) < self._config.min_overlap:
-                health = Health.LOST_NO_OVERLAP
+        # Against the last scan, and each time: in KISS-ICP's map the first scan of another place would be already.
+        agreement = self._agreement(transform(T_odom_sensor, _standing(points)))
+        if health is Health.GOOD and agreement < self._config.min_overlap:
+            health = Health.LOST_NO_OVERLAP
         self._stamp_ns = frame.stamp_ns
         self._frames += 1
         times = frame.column_ns[frame.column_valid]
@@ -164,11 +169,19 @@ class Odometry:
             return Health.LOST_IMPLAUSIBLE_MOTION
         return Health.GOOD
 
-    def _overlap(self, points: np.ndarray, map_before: np.ndarray) -> float:
-        """Share of a sample of the scan with a local map point within one voxel's diagonal."""
-        kept = points[(points**2).sum(axis=1) < self._config.max_range_m**2]  # the map ends there
-        sample = kept[:: max(1, len(kept) // OVERLAP_SAMPLE)]
-        in_map = transform(self._kiss.last_pose, sample)
-        reach = np.sqrt(3.0) * self._config.voxel_size_m
-        tree = cKDTree(map_before)
-        return float(np.isfinite(tree.query(in_map, distance_upper_bound=reach)[0]).mean())
+    def _agreement(self, standing: np.ndarray) -> float:
+        """Share of what stands that stood in the last scan too; 1 where too little stands to tell."""
+        before, self._standing = self._standing, standing
+        if min(len(before), len(standing)) < MIN_STANDING:
+            return 1.0
+        sample = standing[:: max(1, len(standing) // STANDING_SAMPLE)]
+        distance, _ = cKDTree(before).query(sample, distance_upper_bound=AGREES_M)
+        return float(np.isfinite(distance).mean())
+
+
+def _standing(points: np.ndarray) -> np.ndarray:
+    """Those of (N, 3) points in the sensor's frame that stand above the ground nearby."""
+    near = points[(points**2).sum(axis=1) < STANDING_RANGE_M**2]
+    if not len(near):
+        return near
+    return near[near[:, 2] > np.quantile(near[:, 2], 0.25) + STANDING_M]

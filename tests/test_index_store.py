@@ -255,3 +255,15 @@ def test_a_reader_cannot_write(index, session, path):
     with pytest.raises(StorageReadOnly, match="read-only"):
         reader.start_session(**SESSION)
     reader.close()
+
+
+def test_a_visit_is_due_until_it_is_known_how_its_instance_went(index, session):
+    index.add_scene(1, session, np.zeros((3, 2)), 2.5, 20.0)
+    add_visit(index, 1, 1, session, [1, 2])
+    second, third = (add_visit(index, 1, number, session, [2 * number, 2 * number + 1]) for number in (2, 3))
+    open_still = index.open_visit(1, 4, session, 10)
+    assert [(row.visit_id, row.visit, row.map_id) for row in index.visits_due()] == [(second, 2, 1), (third, 3, 1)]
+    index.record_instance(InstanceRow(1, second, "rejected", "not aligned"))
+    assert [row.visit_id for row in index.visits_due()] == [third]
+    index.close_visit(open_still, 12)
+    assert [row.visit_id for row in index.visits_due()] == [third, open_still]

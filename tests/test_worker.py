@@ -10,7 +10,7 @@ import pytest
 from revisitd.daemon.comparison import Job, Selection
 from revisitd.daemon.config import Config
 from revisitd.daemon.detection.results import Thresholds
-from revisitd.daemon.detection_process import DetectionProcess, JobFailed
+from revisitd.daemon.detection_process import DetectionProcess, JobFailed, Stopped
 from revisitd.daemon.worker import DetectionWorker, Instance
 from revisitd.storage.store import Store
 
@@ -59,6 +59,44 @@ def test_an_instance_that_fails_does_not_end_the_detection_of_others(caplog):
     assert "instance failed scene=1" in caplog.text
 
 
+def test_instances_of_earlier_runs_are_done_when_the_queue_is_empty():
+    begun, go, ran = threading.Event(), threading.Event(), []
+
+    def run(job):
+        begun.set()
+        go.wait()
+        ran.append(job.scene_id)
+
+    worker = DetectionWorker(run, queue_size=2, backlog=[instance(7), instance(8)])
+    begun.wait()
+    worker.submit(instance(1), wait=False)
+    assert worker.n_waiting == 2
+    go.set()
+    worker.drain()
+    assert ran == [7, 1, 8]
+    worker.close()
+
+
+def test_a_stop_begins_no_further_instance_and_says_whether_the_one_at_hand_is_done():
+    begun, go, ran = threading.Event(), threading.Event(), []
+
+    def run(job):
+        begun.set()
+        go.wait()
+        ran.append(job.scene_id)
+
+    worker = DetectionWorker(run, queue_size=4)
+    for scene in (1, 2, 3):
+        worker.submit(instance(scene), wait=True)
+    begun.wait()
+    assert worker.busy_s > 0
+    assert not worker.stop(within_s=0.05)
+    go.set()
+    assert worker.stop(within_s=60.0)
+    worker.close()
+    assert ran == [1] and worker.busy_s == 0
+
+
 @pytest.fixture
 def process(tmp_path):
     with Store.open_writer(tmp_path / "data"):
@@ -82,4 +120,20 @@ def test_a_killed_detection_process_fails_one_comparison_and_is_replaced(process
     with pytest.raises(JobFailed, match="died .exit code -9."):
         process.compare(job())
     with pytest.raises(JobFailed, match="ScanFileError"):
+        process.compare(job())
+
+
+def test_a_job_that_does_not_end_fails_and_the_next_one_has_a_new_process(tmp_path):
+    with Store.open_writer(tmp_path / "data"):
+        process = DetectionProcess(tmp_path / "data", timeout_s=0.01)  # its imports take longer
+        first = process.pid
+        with pytest.raises(JobFailed, match="not done after 0.01 s"):
+            process.compare(job())
+        assert process.pid != first
+        process.close()
+
+
+def test_a_killed_program_part_says_nothing_against_the_job(process):
+    process.kill()
+    with pytest.raises(Stopped):
         process.compare(job())
