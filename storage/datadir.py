@@ -21,6 +21,7 @@ from typing import IO
 
 from .errors import DataDirBusy, DataDirError, NewerFormat
 from .files import make_dir, write_atomically
+from .filesystem import refuse_network
 
 FORMAT = "revisitd data directory"
 VERSION = 1
@@ -41,6 +42,7 @@ class DataDir:
         Raises DataDirBusy, NewerFormat, DataDirError, OSError (no permission, disk full).
         """
         path = Path(path)
+        refuse_network(path)
         make_dir(path)
         lock = _take_lock(path)
         try:
@@ -73,6 +75,10 @@ class DataDir:
     @property
     def changes_path(self) -> Path:
         return self.path / "changes.db"
+
+    @property
+    def places_path(self) -> Path:
+        return self.path / "places.jsonl"
 
     @property
     def scans_path(self) -> Path:

@@ -76,14 +76,14 @@ class ScanStore:
                 write_atomically(path, data, self._temporary_dir)
         return len(data)
 
-    def read(self, session: int, scan_id: int) -> Scan:
-        """Read a scan, bit by bit what was written. Raises ScanFileError."""
+    def read(self, session: int, scan_id: int, images: bool = True) -> Scan:
+        """Read a scan, bit by bit what was written; without images, what its index row needs. Raises ScanFileError."""
         path = self.path(session, scan_id)
         try:
             data = path.read_bytes()
         except FileNotFoundError:
             raise ScanFileError(f"{path}: no such scan file; was it deleted by hand?") from None
-        scan = Scan(**scanfile.decode(data, path))
+        scan = Scan(**scanfile.decode(data, path, images))
         if (scan.session, scan.scan_id) != (session, scan_id):
             raise ScanFileError(f"{path}: holds scan {scan.scan_id} of session {scan.session}: move it back")
         return scan
