@@ -20,7 +20,7 @@ from . import database
 from .errors import StorageError
 from .schema import CHANGES_MIGRATIONS
 
-BUSY_TIMEOUT_S = 120.0  # the detection thread writes here: it may wait, what it found must not be lost
+BUSY_TIMEOUT_S = 5.0  # the detection thread writes here, and tries again
 POINT_VOXEL_M = 0.05  # a change holds at most one point in each such cube, so that n_points means the same always
 
 

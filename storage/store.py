@@ -14,6 +14,7 @@ from .errors import StorageError
 from .index import IndexStore
 from .placeslog import PlacesLog
 from .recovery import open_changes, open_index
+from .reserve import Reserve
 from .retention import Retention, finish_garbage
 from .scans import Scan, ScanStore
 
@@ -37,6 +38,7 @@ class Store:
         Raises DataDirBusy, DataDirError, NewerFormat, DatabaseFileError, StorageUnavailable, OSError (no permission).
         """
         repairs: list[str] = []
+        Reserve(Path(path)).release_if_full()
         with ExitStack() as opened:
             data_dir = DataDir.open_writer(path)
             opened.callback(data_dir.close)

@@ -66,6 +66,7 @@ def test_a_damaged_or_lost_index_is_rebuilt_as_it_was(data, harm):
         assert len(store.repairs) == 1
         assert "rebuilt with 2 sessions, 20 scans, 3 scenes, 4 visits" in store.repairs[0]
         assert "lost: the records of detection instances" in store.repairs[0]
+        assert store.index.visits_due() == []
         assert store.index.next_scene_id() == 4
         assert store.new_scan_id() == 21
         assert store.index.start_session(**SESSION) == 3
