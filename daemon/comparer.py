@@ -14,8 +14,9 @@ import numpy as np
 
 from ..drivers.frame import Sensor
 from ..storage.datadir import DataDir
+from ..storage.errors import ScanFileError
 from ..storage.scans import Scan, ScanStore
-from .comparison import Comparison, Job, ScanFacts, Selection
+from .comparison import MIN_SCANS, Comparison, Job, ScanFacts, Selection
 from .detection.detector import Side, detect, side_of
 from .detection.erasure import update_map
 from .detection.occlusion import state_of
@@ -37,7 +38,7 @@ class Comparer:
         self._sensors = Sensors(directory)
 
     def compare(self, job: Job) -> Comparison:
-        """Raises ScanFileError where a scan's file is damaged or gone."""
+        """Raises ScanFileError where too few scans of a side can be read."""
         watch = Stopwatch()
         before, n_before, facts_before = self._side(job.cumulative, job, watch)
         now, n_now, facts_now = self._side(job.recent, job, watch)
@@ -51,19 +52,21 @@ class Comparer:
 
     def _side(self, selection: Selection, job: Job, watch: Stopwatch) -> tuple[Side, int, ScanFacts]:
         """One side of the comparison; how many points it has with its ground, which are not kept."""
-        submap, facts = self.load(selection, job.range_m)
+        submap, facts, loaded = self.load(selection.only(selection.chosen), job.range_m)
+        if len(loaded.scan_id) < MIN_SCANS:
+            raise ScanFileError(f"{len(loaded.scan_id)} of {selection.chosen.sum()} scans can be read: too few")
         watch.lap("load")
-        submap = _updated(submap, selection.only(selection.chosen), job.erasures)
+        submap = _updated(submap, loaded, job.erasures)
         watch.lap("update_map")
         side = side_of(submap, job.thresholds, _More(self, selection, facts, job).around)
         watch.lap("ground")
         return side, len(submap.points), facts
 
-    def load(self, selection: Selection, range_m: float) -> tuple[Submap, ScanFacts]:
-        """The submap of a selection's chosen scans."""
-        chosen = selection.only(selection.chosen)
-        submap, scans = build_submap(lambda i: self.read(chosen, i), chosen.visit, range_m)
-        return submap, _facts(scans, chosen.moment)
+    def load(self, selection: Selection, range_m: float) -> tuple[Submap, ScanFacts, Selection]:
+        """The submap of those scans of a selection that can be read, and which these are."""
+        submap, scans, there = build_submap(lambda i: self.read(selection, i), selection.visit, range_m)
+        loaded = selection.only(there)
+        return submap, _facts(scans, loaded.moment), loaded
 
     def read(self, selection: Selection, i: int) -> tuple[Scan, Sensor]:
         """One scan of a selection and its sensor."""
@@ -88,12 +91,11 @@ class _More:
         return self._loaded[nearest].around(lower, upper)
 
     def _load(self, selection: Selection) -> Submap:
-        submap, scans = build_submap(lambda i: self._comparer.read(selection, i), selection.visit, self._job.range_m)
-        facts = _facts(scans, selection.moment)
+        submap, facts, loaded = self._comparer.load(selection, self._job.range_m)
         self._facts.session.update(facts.session)
         self._facts.stamp_ns.update(facts.stamp_ns)
         self._facts.host_ns.update(facts.host_ns)
-        return _updated(submap, selection, self._job.erasures)
+        return _updated(submap, loaded, self._job.erasures)
 
 
 def _updated(submap: Submap, selection: Selection, erasures: list[Erasure]) -> Submap:

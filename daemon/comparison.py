@@ -8,6 +8,8 @@ import numpy as np
 
 from .detection.results import Detection, Erasure, KnownChange, KnownState, Thresholds
 
+MIN_SCANS = 4  # a submap of fewer says too little: most false changes come from visits that only touch a scene
+
 
 @dataclass(frozen=True, eq=False)
 class Selection:

@@ -1,4 +1,4 @@
-"""The housekeeping thread: keeps the data directory within its limits and backs up what was found."""
+"""The housekeeping thread: keeps the data directory within its limits, and copies of what must not be lost."""
 
 from __future__ import annotations
 
@@ -74,6 +74,7 @@ class Housekeeping:
     def _loop(self) -> None:
         while not self._stopped:
             self._attempt(self._keep_limits)
+            self._attempt(self._store.log_places)
             self._attempt(self._back_up)
             self._attempt(self._count)
             self._store.grown.wait(PERIOD_S)

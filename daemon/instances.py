@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from ..storage.errors import StorageUnavailable
 from ..storage.index import InstanceRow, SceneScans
 from ..storage.store import Store
 from .changes import ChangeManager, Finding
-from .comparison import Comparison, Job, Selection
+from .comparison import MIN_SCANS, Comparison, Job, Selection
 from .config import Config
 from .detection.results import DetectedObject, Thresholds
 from .detection_process import DetectionProcess, JobFailed, Stopped
@@ -21,7 +24,7 @@ from .worker import Instance
 
 logger = logging.getLogger(__name__)
 
-MIN_SCANS = 4  # a submap of fewer says too little: most false changes come from visits that only touch a scene
+PATIENCE_S, RETRY_S = 75.0, 2.0  # what was found is worth waiting for a full disk or a locked changes.db
 REFERENCE_ALPHA_M2 = 120.0  # the scene size at which `submaps.k` is stated; k grows with alpha (CDSD section V)
 
 
@@ -44,6 +47,7 @@ class ChangeDetection:
         self._manager = ChangeManager(store.changes)
         self._process = process
         self.n_changes = 0  # change objects new in this run
+        self.hurry = threading.Event()  # set when the program ends: nothing is waited for any more
 
     @property
     def settings(self) -> str:
@@ -62,21 +66,25 @@ class ChangeDetection:
         """Detect the changes of one visit against all visits before, and record how it went."""
         start = time.perf_counter()
         self._config = self._wanted
-        index, row = self._store.index, {"scene_id": instance.scene_id, "visit_id": instance.visit_id}
+        row, where = {"scene_id": instance.scene_id, "visit_id": instance.visit_id}, (instance.scene_id, instance.visit)
         try:
             job = self.job(instance)
             comparison = self._process.compare(job)
         except Stopped:
-            logger.info("instance left for the next start: scene=%d visit=%d", instance.scene_id, instance.visit)
+            logger.info("instance left for the next start: scene=%d visit=%d", *where)
             return
         except (Rejected, JobFailed) as why:
             status = "rejected" if isinstance(why, Rejected) else "failed"
-            logger.info("instance %s scene=%d visit=%d: %s", status, instance.scene_id, instance.visit, why)
-            index.record_instance(InstanceRow(**row, status=status, reason=str(why)))
+            logger.info("instance %s scene=%d visit=%d: %s", status, *where, why)
+            self._note(InstanceRow(**row, status=status, reason=str(why)))
             return
-        n_new = self._record(comparison, instance)
+        try:
+            n_new = self._patiently(lambda: self._record(comparison, instance))
+        except StorageUnavailable as why:
+            logger.error("not stored, left for the next start: scene=%d visit=%d: %s", *where, why)
+            return
         self.n_changes += n_new
-        index.record_instance(
+        self._note(
             InstanceRow(
                 **row,
                 status="done",
@@ -90,6 +98,12 @@ class ChangeDetection:
                 alignment_residual_m=comparison.recent.residual_m,
             )
         )
+
+    def _note(self, row: InstanceRow) -> None:
+        try:
+            self._store.index.record_instance(row)
+        except StorageUnavailable as why:
+            logger.warning("an instance is not in the record: %s", why)
 
     def _choose(self, scans: SceneScans) -> Selection:
         """Of the scans whose poses can be trusted in this scene, those that represent the visits best (OptMap)."""
@@ -124,8 +138,27 @@ class ChangeDetection:
             Thresholds(**self._config.detection.model_dump()),
         )
 
+    def _patiently(self, record: Callable[[], int]) -> int:
+        """Record what was found, as soon as the disk is not full and no other program holds changes.db.
+
+        Raises StorageUnavailable after PATIENCE_S, or when `hurry` is set.
+        """
+        until = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return record()
+            except StorageUnavailable as why:
+                if self.hurry.is_set() or time.monotonic() > until:
+                    raise
+                logger.error("changes wait to be stored: %s", why)
+            self.hurry.wait(RETRY_S)
+
     def _record(self, comparison: Comparison, instance: Instance) -> int:
-        """Hand the objects to the change manager; how many of them are new."""
+        """Hand the objects to the change manager, all of an instance or none; how many of them are new."""
+        with self._store.changes.transaction():
+            return self._record_all(comparison, instance)
+
+    def _record_all(self, comparison: Comparison, instance: Instance) -> int:
         n_new, before, after = 0, comparison.cumulative, comparison.recent
         for found in comparison.detection.objects:
             finding = Finding(

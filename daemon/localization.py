@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import small_gicp
 
+from ..storage.errors import ScanFileError
 from .config import AlignmentConfig
 from .geometry import inverse, rotation_angle_rad
 from .local_map import LocalMap
@@ -34,7 +35,8 @@ class Fix:
 class Localizer:
     """Keeps T_map_odom up to date.
 
-    load_reference(scene) gives points (N, 3) float32 of the scene's first visit in the map frame.
+    load_reference(scene) gives points (N, 3) float32 of the scene's first visit in the map frame; it raises
+    ScanFileError where none of its scans is left.
     """
 
     def __init__(self, config: AlignmentConfig, load_reference: Callable[[Scene], np.ndarray], T_map_odom: np.ndarray):
@@ -73,7 +75,11 @@ class Localizer:
         drifted = self._travel_since_fix_m > MIN_COARSE_TRAVEL_M
         attempts = [(scene, coarse) for coarse in (drifted, True) for scene in scenes[:2]]
         for scene, coarse in dict.fromkeys(attempts):
-            match = self._register(source, predicted, scene, coarse)
+            try:
+                match = self._register(source, predicted, scene, coarse)
+            except ScanFileError as why:
+                reason = str(why)
+                continue
             reason = self._objection(match, predicted)
             if not reason:
                 self._travel_since_fix_m = 0.0

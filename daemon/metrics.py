@@ -8,6 +8,7 @@ from .status import Status
 
 METRICS_FILE = "revisitd.prom"  # beside the status; point the collector's directory at it, or link it there
 
+
 def write_metrics(path: Path, status: Status) -> None:
     """Replace the file at once: a collector must never read half of it. Raises OSError."""
     unfinished = path.with_name(f".{path.name}.tmp")

@@ -38,7 +38,7 @@ def place_history(
 ) -> list[PlaceSeen]:
     """Every visit to the scenes around a place (3,) metres in a map, in order of time.
 
-    Sight is that of the occlusion filter: limits gives its range and margin. Raises ScanFileError.
+    Sight is that of the occlusion filter: limits gives its range and margin.
     """
     sensors = Sensors(store.dir)
     samples = (place + radius_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)).astype(np.float32)
@@ -71,8 +71,7 @@ def _seen(
 ) -> PlaceSeen:
     scene, scans = scene_and_scans
     images = []
-    for session, scan_id in zip(scans.session.tolist(), scans.scan_id.tolist(), strict=True):
-        scan = store.scans.read(session, scan_id)
+    for scan in store.scans.read_all(zip(scans.session.tolist(), scans.scan_id.tolist(), strict=True)):
         images.append(scan_view(scan, sensors.get(scan.sensor_digest), limits.occlusion_range_m)[2])
     seen = sight(samples, images, limits.occlusion_margin_m, limits.occlusion_range_m)
     occupied, free = float((seen.at > seen.through).mean()), float((seen.through > seen.at).mean())

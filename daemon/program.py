@@ -55,6 +55,7 @@ class Program:
         """End the session; let the instance at hand finish if it does so in time, and leave the others for the next
         run: the index knows them."""
         self.pipeline.finish()
+        self.detection.hurry.set()
         if not self.worker.stop(within_s):
             self.process.kill()
 

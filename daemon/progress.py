@@ -56,6 +56,8 @@ def summary_text(summary: Summary) -> str:
         f"{summary.instances_done} instances of change detection, {summary.instances_dropped} dropped, "
         f"{summary.instances_failed} failed; {summary.changes} changes",
     ]
+    if c.not_stored:
+        lines.append(f"{c.not_stored} key scans not stored: the disk or the index did not take them")
     if c.odometry_lost:
         lines.append(f"odometry lost {c.odometry_lost} times: each began a new session")
     if c.joined_maps:

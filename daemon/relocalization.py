@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..storage.errors import ScanFileError
 from ..storage.rows import SceneScans
 from ..storage.store import Store
 from .config import AlignmentConfig
@@ -101,11 +102,16 @@ class Relocator:
         order = np.argsort(-(descriptors @ descriptor), kind="stable")
         _, first = np.unique(scenes[order], return_index=True)
         nearest = order[np.sort(first)[:SCENES]]
-        return [self._place(int(scene_maps[i]), int(scenes[i])) for i in nearest]
+        places = [self._place(int(scene_maps[i]), int(scenes[i])) for i in nearest]
+        return [place for place in places if place is not None]
 
-    def _load_place(self, map_id: int, scene_id: int) -> Place:
+    def _load_place(self, map_id: int, scene_id: int) -> Place | None:
+        """None where no scan of the scene's first visit is left."""
         first_visit = self._store.index.scans_of_scene(scene_id, visit=1)
-        points = self._points(first_visit, PLAN_SCANS)
+        try:
+            points = self._points(first_visit, PLAN_SCANS)
+        except ScanFileError:
+            return None
         return Place(map_id, scene_id, PlacePlan(points, first_visit.T_map_sensor), surface_of(points, COARSE_VOXEL_M))
 
     def _load_surface(self, scene_id: int) -> Surface:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from ..drivers.frame import Sensor
+from ..storage.errors import ScanFileError
 from ..storage.scans import Scan
 from .detection.jit import kernel
 from .detection.submap import DepthImage, Submap, depth_image
 from .geometry import column_phase, fraction_of, inverse
 from .views import OWN_BODY_M
+
+logger = logging.getLogger(__name__)
 
 # Depth images are taken from the middle of the sweep: half the parallax of either end.
 MID_SWEEP = 0.5
@@ -21,15 +25,29 @@ THREADS = 2
 
 def build_submap(
     read: Callable[[int], tuple[Scan, Sensor]], visits: np.ndarray, range_m: float
-) -> tuple[Submap, list[Scan]]:
-    """The submap of some scans, read(0) to read(S - 1), of visits (S,); read and projected on two threads."""
+) -> tuple[Submap, list[Scan], np.ndarray]:
+    """The submap of some scans, read(0) to read(S - 1), of visits (S,); read and projected on two threads.
+
+    Scans that cannot be read (ScanFileError: just deleted by the retention, or damaged) are done without; the last
+    result says which are there, (S,) bool.
+    """
+
+    def view(i: int) -> tuple[Scan, np.ndarray, DepthImage] | None:
+        try:
+            return scan_view(*read(i), range_m)
+        except ScanFileError as error:
+            logger.warning("compared without a scan: %s", error)
+            return None
+
     with ThreadPoolExecutor(THREADS, thread_name_prefix="submap") as pool:
-        views = list(pool.map(lambda i: scan_view(*read(i), range_m), range(len(visits))))
+        tried = list(pool.map(view, range(len(visits))))
+    there = np.array([found is not None for found in tried], dtype=bool)
+    views = [found for found in tried if found is not None]
     scans = [view[0] for view in views]
     points = np.concatenate([np.empty((0, 3), np.float32), *(view[1] for view in views)])
     scan_index = np.repeat(np.arange(len(views), dtype=np.int16), [len(view[1]) for view in views])
     stamps = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
-    return Submap(points, scan_index, [view[2] for view in views], visits, stamps), scans
+    return Submap(points, scan_index, [view[2] for view in views], visits[there], stamps), scans, there
 
 
 def scan_view(scan: Scan, sensor: Sensor, range_m: float) -> tuple[Scan, np.ndarray, DepthImage]:

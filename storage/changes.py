@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from . import database
 from .errors import StorageError
 from .schema import CHANGES_MIGRATIONS
 
-BUSY_TIMEOUT_S = 120.0  # the detection thread writes here: it may wait, what it found must not be lost
+BUSY_TIMEOUT_S = 5.0  # the detection thread writes here, and tries again
 POINT_VOXEL_M = 0.05  # a change holds at most one point in each such cube, so that n_points means the same always
 
 
@@ -58,6 +59,15 @@ class ChangeObject(Change):
     n_points: int
     detected_host_ns: int
     updated_host_ns: int
+
+
+@dataclass(frozen=True)
+class MergedChange:
+    """A change that turned out to be part of another, and is none any more."""
+
+    revision: int
+    id: int
+    into_id: int
 
 
 class ChangeStore:
@@ -132,13 +142,16 @@ class ChangeStore:
         with self._db.transaction():
             part, whole = self.get(part_id), self.get(whole_id)
             self.extend(whole_id, part.points, max(part.confidence, whole.confidence), whole.evidence)
-            for column, table in (
-                ("change_id", "observations"),
-                ("superseded_by", "changes"),
-                ("whole_id", "merged_changes"),
-            ):
+            for (other_id,) in self._db.tuples("SELECT id FROM changes WHERE superseded_by = ?", (part_id,)):
+                self._update(other_id, {"superseded_by": whole_id})
+            for column, table in (("change_id", "observations"), ("whole_id", "merged_changes")):
                 self._db.write(f"UPDATE {table} SET {column} = ? WHERE {column} = ?", (whole_id, part_id))
-            row = {"part_id": part_id, "whole_id": whole_id, "merged_host_ns": time.time_ns()}
+            row = {
+                "part_id": part_id,
+                "whole_id": whole_id,
+                "merged_host_ns": time.time_ns(),
+                "revision": self._next_revision(),
+            }
             self._db.insert("merged_changes", row)
             self._db.write("DELETE FROM changes WHERE id = ?", (part_id,))
 
@@ -165,6 +178,24 @@ class ChangeStore:
             self._observe(change_id, kind, **where, time_ns=time_ns, shares=shares)
             if kind != "unseen":
                 self._update(change_id, {"state": "ended", "superseded_by": superseded_by} if kind == "gone" else {})
+
+    def transaction(self) -> AbstractContextManager[None]:
+        """What is written inside is there whole or not at all: all that one instance found, for instance."""
+        return self._db.transaction()
+
+    def skip_used_numbers(self) -> None:
+        """After older contents were restored: ids and revisions that were given since must not be given again.
+
+        They go on from the time in seconds, which no store can have reached at a change each second.
+        """
+        now_s = int(time.time())
+        with self._db.transaction():
+            self._db.write("UPDATE store SET last_revision = max(last_revision, ?)", (now_s,))
+            self._db.write(
+                """INSERT INTO sqlite_sequence (name, seq)
+                   SELECT 'changes', 0 WHERE NOT EXISTS (SELECT 1 FROM sqlite_sequence WHERE name = 'changes')"""
+            )
+            self._db.write("UPDATE sqlite_sequence SET seq = max(seq, ?) WHERE name = 'changes'", (now_s,))
 
     # Reading ------------------------------------------------------------------------------------------------------
 
@@ -213,6 +244,19 @@ class ChangeStore:
     def count_present(self) -> int:
         """Changes that hold."""
         return self._db.value("SELECT count(*) FROM changes WHERE state = 'present'")
+
+    def since(self, revision: int, with_points: bool = False) -> list[ChangeObject | MergedChange]:
+        """What is new or altered after a revision, in the order of revisions; each change once, as it is now.
+
+        Exact: whoever goes on from the last one's revision misses nothing and sees nothing twice unaltered.
+        """
+        with self._db.snapshot():
+            changed = self._select("revision > ?", [revision], with_points)
+            merged = self._db.rows(
+                "SELECT revision, part_id AS id, whole_id AS into_id FROM merged_changes WHERE revision > ?",
+                (revision,),
+            )
+        return sorted([*changed, *(MergedChange(**row) for row in merged)], key=lambda entry: entry.revision)
 
     def publish_change_list(self, n: int) -> list[ChangeObject]:
         """Metadata of all changes of at least n points, without the points (CDSD section III-D)."""
@@ -265,7 +309,8 @@ class ChangeStore:
         self._db.write(f"UPDATE changes SET {assignments} WHERE id = ?", (*values.values(), change_id))
 
     def _next_revision(self) -> int:
-        return self._db.value("SELECT coalesce(max(revision), 0) + 1 FROM changes")
+        """In a transaction: what is committed later has higher revisions, so a reader misses nothing."""
+        return self._db.value("UPDATE store SET last_revision = last_revision + 1 RETURNING last_revision")
 
 
 # Every column but the points, under the names of ChangeObject's fields.

@@ -44,18 +44,14 @@ class Connection:
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """All that is written inside becomes visible and durable at once, or not at all. May be nested."""
-        with self._lock:
-            if self._db.conn.in_transaction:  # the outermost one commits
-                yield
-                return
-            self._execute("BEGIN IMMEDIATE")
-            try:
-                yield
-                self._execute("COMMIT")
-            except BaseException:
-                if self._db.conn.in_transaction:
-                    self._execute("ROLLBACK")
-                raise
+        with self._between("BEGIN IMMEDIATE"):
+            yield
+
+    @contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All queries inside see the same moment."""
+        with self._between("BEGIN"):
+            yield
 
     def write(self, sql: str, values: Values = ()) -> int:
         """Run one statement; the rowid of what it inserted. Durable at once unless in a transaction."""
@@ -115,6 +111,22 @@ class Connection:
             finally:
                 self._db.close()
 
+    @contextmanager
+    def _between(self, begin: str) -> Iterator[None]:
+        """In a transaction; in the outer one where there is one, which then commits."""
+        with self._lock:
+            if self._db.conn.in_transaction:
+                yield
+                return
+            self._execute(begin)
+            try:
+                yield
+                self._execute("COMMIT")
+            except BaseException:
+                if self._db.conn.in_transaction:
+                    self._execute("ROLLBACK")
+                raise
+
     def _execute(self, sql: str) -> None:
         with self._using():
             self._db.execute(sql)
@@ -130,6 +142,14 @@ class Connection:
                 if self._writes:
                     suspicion(self._path).touch()
                 raise
+
+
+def version(path: Path) -> int:
+    """The schema's version; 0 where there is no file, or nothing in it. Raises DatabaseFileError."""
+    if not path.exists():
+        return 0
+    with naming(path), closing(_connect_read_only(path)) as connection:
+        return connection.execute("PRAGMA user_version").fetchone()[0]
 
 
 def suspicion(path: Path) -> Path:

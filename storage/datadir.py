@@ -4,8 +4,10 @@ DIR/revisitd.json            uuid and format version of the directory
 DIR/lock                     held by the writer (flock: a killed process lets go of it)
 DIR/index.db                 scans, scenes, visits: can be rebuilt from the scan files
 DIR/changes.db               what changed: precious
+DIR/places.jsonl             sessions, scenes and visits once more, for that
 DIR/sensors/<digest>.json    metadata of each sensor, as it gave it
 DIR/scans/<session>/...      one file for each key scan
+DIR/reserve                  space that is given back on a full disk
 DIR/backups/changes-<UTC>.db copies of changes.db
 """
 
@@ -20,7 +22,9 @@ from pathlib import Path
 from typing import IO
 
 from .errors import DataDirBusy, DataDirError, NewerFormat
+from .faults import naming
 from .files import make_dir, write_atomically
+from .filesystem import refuse_network
 
 FORMAT = "revisitd data directory"
 VERSION = 1
@@ -38,9 +42,15 @@ class DataDir:
     def open_writer(cls, path: Path) -> DataDir:
         """Open for writing, made if it is not there. One writer at a time.
 
-        Raises DataDirBusy, NewerFormat, DataDirError, OSError (no permission, disk full).
+        Raises DataDirBusy, NewerFormat, DataDirError, StorageUnavailable, OSError (no permission).
         """
         path = Path(path)
+        refuse_network(path)
+        with naming(path):
+            return cls._open_writer(path)
+
+    @classmethod
+    def _open_writer(cls, path: Path) -> DataDir:
         make_dir(path)
         lock = _take_lock(path)
         try:
@@ -75,6 +85,10 @@ class DataDir:
         return self.path / "changes.db"
 
     @property
+    def places_path(self) -> Path:
+        return self.path / "places.jsonl"
+
+    @property
     def scans_path(self) -> Path:
         return self.path / "scans"
 
@@ -83,10 +97,14 @@ class DataDir:
         return self.path / "backups"
 
     def put_sensor(self, digest: str, metadata: str) -> None:
-        """Keep a sensor's metadata JSON under its digest. The first text of a digest stays."""
+        """Keep a sensor's metadata JSON under its digest. The first text of a digest stays.
+
+        Raises StorageUnavailable, OSError.
+        """
         path = self._sensor_path(digest)
         if not path.exists():
-            write_atomically(path, metadata.encode(), path.parent)
+            with naming(path):
+                write_atomically(path, metadata.encode(), path.parent)
 
     def get_sensor(self, digest: str) -> str:
         """A sensor's metadata JSON. Raises DataDirError."""

@@ -34,8 +34,8 @@ _OF_SQLITE: tuple[tuple[str, type[StorageError], str], ...] = (
     ("readonly database", StorageReadOnly, READ_ONLY),
     ("is locked", StorageBusy, "another program writes to it: end that, or let it commit"),
     ("disk I/O error", StorageUnavailable, FAILING),
-    ("malformed", DatabaseCorrupt, "damaged: the next start of the daemon puts a good one in its place"),
-    ("not a database", DatabaseCorrupt, "not a database: the next start of the daemon puts a good one in its place"),
+    ("malformed", DatabaseCorrupt, "damaged: the next start of the daemon mends it"),
+    ("not a database", DatabaseCorrupt, "not a database: the next start of the daemon mends it"),
 )
 
 
@@ -43,12 +43,12 @@ _OF_SQLITE: tuple[tuple[str, type[StorageError], str], ...] = (
 def naming(path: Path) -> Iterator[None]:
     """Around an access to one file: what the system and SQLite raise names no file, or no remedy.
 
-    Raises StorageError of the fitting kind. A violated constraint (sqlite3.IntegrityError) is the caller's own
-    mistake and stays as it is, as does an OSError that is not of the disk (no permission, no such file).
+    Raises StorageError of the fitting kind. A violated constraint (sqlite3.IntegrityError) or a wrong use is the
+    caller's own mistake and stays as it is, as does an OSError that is not of the disk (no permission, no such file).
     """
     try:
         yield
-    except sqlite3.IntegrityError:
+    except (sqlite3.IntegrityError, sqlite3.ProgrammingError):
         raise
     except sqlite3.DatabaseError as error:
         raise of_sqlite(path, error) from error

@@ -210,9 +210,9 @@ class IndexStore:
         return self.db.insert("visits", row)
 
     def add_visit_scans(self, visit_id: int, scan_ids: Iterable[int]) -> None:
-        """Note scans as part of a visit."""
+        """Note scans as part of a visit; those that the retention had to delete meanwhile are passed over."""
         rows = [(visit_id, scan_id) for scan_id in scan_ids]
-        self.db.write_many("INSERT INTO visit_scans (visit_id, scan_id) VALUES (?, ?)", rows)
+        self.db.write_many("INSERT INTO visit_scans SELECT ?, scan_id FROM scans WHERE scan_id = ?", rows)
 
     def close_visit(self, visit_id: int, t_out_ns: int) -> None:
         """Note that a visit ended."""

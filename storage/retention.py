@@ -14,7 +14,9 @@ from pathlib import Path
 
 from . import database
 from .datadir import DataDir
+from .errors import StorageFull
 from .faults import naming
+from .reserve import Reserve
 from .scans import ScanStore
 from .usefulness import Tier, Victim, least_useful
 
@@ -60,6 +62,7 @@ class Retention:
         self._dir, self._scans, self._index = data_dir, scans, index
         self._quota_bytes, self._min_free_bytes = quota_bytes, min_free_bytes
         self._kept_per_visit, self._recent_ns = kept_per_visit, recent_ns
+        self._reserve = Reserve(data_dir.path)
         self._plan: list[Victim] = []  # the next to go last
         self._plan_until_s = 0.0
         self._deleting = False  # between HIGH and LOW
@@ -84,8 +87,19 @@ class Retention:
             if not victims:
                 problem = f"{free / 1e9:.2f} GB are free and no scan may go: free some, or lower storage.min_free_gb"
         if victims:
-            discard(self._index, self._scans, [(victim.session, victim.scan_id) for victim in victims])
+            self._discard([(victim.session, victim.scan_id) for victim in victims])
+        else:
+            with naming(self._dir.path):
+                self._reserve.hold()
         return RetentionReport(used, free, len(victims), bool(victims), problem)
+
+    def _discard(self, ids: list[tuple[int, int]]) -> None:
+        try:
+            discard(self._index, self._scans, ids)
+        except StorageFull:
+            if not self._reserve.release():
+                raise
+            discard(self._index, self._scans, ids)
 
     def _take(self, excess_bytes: float, highest: Tier) -> list[Victim]:
         """The next victims, until they make up for the excess."""

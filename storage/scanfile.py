@@ -65,8 +65,11 @@ def encode(scan: Scan) -> bytes:
     return prefix + head + body
 
 
-def decode(data: bytes, path: Path) -> dict[str, Any]:
-    """The bytes of a file -> the fields of a Scan. Raises ScanFileError, which names `path`."""
+def decode(data: bytes, path: Path, images: bool = True) -> dict[str, Any]:
+    """The bytes of a file -> the fields of a Scan. Raises ScanFileError, which names `path`.
+
+    images False: range_mm and reflectivity stay compressed, and are None.
+    """
     head, body = _checked(data, path)
     try:
         fields = json.loads(head)
@@ -79,21 +82,24 @@ def decode(data: bytes, path: Path) -> dict[str, Any]:
             fields[name] = np.array(fields[name], np.float64).reshape(4, 4)
         if fields["alignment_residual_m"] is None:
             fields["alignment_residual_m"] = math.nan
-        fields.update(_arrays(parts, height, width))
+        fields.update(_arrays(parts, height, width, images))
     except (KeyError, ValueError, TypeError, zstandard.ZstdError) as error:
         # The checksum held, so the disk is not to blame: whoever wrote the file did something else.
         raise ScanFileError(f"{path}: not laid out as version {VERSION} has it ({error}); {HINT}") from error
     return fields
 
 
-def _arrays(parts: dict[str, memoryview], height: int, width: int) -> dict[str, np.ndarray]:
+def _arrays(parts: dict[str, memoryview], height: int, width: int, images: bool) -> dict[str, np.ndarray | None]:
     """The arrays of a Scan from the parts of the body."""
     steps = _from_byte_planes(_decompress(parts["column_ns"]), (width,), np.dtype("<u8"))
-    reflectivity = np.frombuffer(_decompress(parts["reflectivity"]), np.uint8)
     valid_bits = np.frombuffer(parts["column_valid"], np.uint8)
+    range_mm = reflectivity = None
+    if images:
+        range_mm = _from_byte_planes(_decompress(parts["range_mm"]), (height, width), np.dtype("<u4"))
+        reflectivity = np.frombuffer(_decompress(parts["reflectivity"]), np.uint8).reshape(height, width)
     return {
-        "range_mm": _from_byte_planes(_decompress(parts["range_mm"]), (height, width), np.dtype("<u4")),
-        "reflectivity": reflectivity.reshape(height, width),
+        "range_mm": range_mm,
+        "reflectivity": reflectivity,
         "column_ns": np.cumsum(steps.view(np.int64)),
         "column_valid": np.unpackbits(valid_bits, count=width).astype(bool),
         "descriptor": np.frombuffer(parts["descriptor"], "<f4").astype(np.float32),

@@ -6,6 +6,7 @@ Layout: `scans/<session>/<scan_id // 1000>/<scan_id>.scan`. The bytes of a file 
 from __future__ import annotations
 
 import errno
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from . import scanfile
 from .errors import ScanFileError
 from .faults import naming
 from .files import make_dir, sync_dir, write_atomically
+
+logger = logging.getLogger(__name__)
 
 SUFFIX = ".scan"
 IDS_PER_DIR = 1000
@@ -76,17 +79,27 @@ class ScanStore:
                 write_atomically(path, data, self._temporary_dir)
         return len(data)
 
-    def read(self, session: int, scan_id: int) -> Scan:
-        """Read a scan, bit by bit what was written. Raises ScanFileError."""
+    def read(self, session: int, scan_id: int, images: bool = True) -> Scan:
+        """Read a scan, bit by bit what was written; without images, what its index row needs. Raises ScanFileError."""
         path = self.path(session, scan_id)
         try:
             data = path.read_bytes()
         except FileNotFoundError:
-            raise ScanFileError(f"{path}: no such scan file; was it deleted by hand?") from None
-        scan = Scan(**scanfile.decode(data, path))
+            raise ScanFileError(f"{path}: no such scan file: deleted by the retention, or by hand") from None
+        scan = Scan(**scanfile.decode(data, path, images))
         if (scan.session, scan.scan_id) != (session, scan_id):
             raise ScanFileError(f"{path}: holds scan {scan.scan_id} of session {scan.session}: move it back")
         return scan
+
+    def read_all(self, ids: Iterable[tuple[int, int]]) -> list[Scan]:
+        """Those scans (session, scan_id) that can be read: one may be deleted at any time, or be damaged."""
+        found = []
+        for session, scan_id in ids:
+            try:
+                found.append(self.read(session, scan_id))
+            except ScanFileError as error:
+                logger.warning("done without: %s", error)
+        return found
 
     def delete(self, ids: Iterable[tuple[int, int]]) -> None:
         """Remove the files of scans (session, scan_id), durably, and the folders that they leave empty.

@@ -218,5 +218,29 @@ SELECT o.change_id, c.polarity, o.kind AS seen_as, o.session_id, o.scene_id, o.v
 FROM observations AS o JOIN changes AS c ON c.id = o.change_id ORDER BY o.observation_id;
 """
 
+CHANGES_V3 = """
+ALTER TABLE store ADD COLUMN last_revision INTEGER NOT NULL DEFAULT 0;
+                                       -- the highest revision ever given, to a change or to a merge
+ALTER TABLE merged_changes ADD COLUMN revision INTEGER;
+                                       -- of the merge: in one order with the revisions of changes
+UPDATE merged_changes SET revision = (SELECT coalesce(max(revision), 0) FROM changes)
+    + (SELECT count(*) FROM merged_changes AS other WHERE other.part_id <= merged_changes.part_id);
+CREATE UNIQUE INDEX merged_changes_by_revision ON merged_changes (revision);
+UPDATE store SET last_revision = max((SELECT coalesce(max(revision), 0) FROM changes),
+                                     (SELECT coalesce(max(revision), 0) FROM merged_changes));
+
+CREATE VIEW change_feed AS             -- for programs that wait: WHERE revision > :the_last_one_seen ORDER BY revision
+SELECT revision,
+       'changed' AS event,             -- changed: a new change, or an altered one as it is now
+                                       -- merged: id is no change any more, but a part of merged_into
+       id, NULL AS merged_into, polarity, state, superseded_by, x, y, z, n_points, confidence,
+       first_seen_ns, first_seen_host_ns, map_id, session_id, scene_id, visit
+FROM changes
+UNION ALL
+SELECT revision, 'merged', part_id, whole_id, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
+       NULL, NULL, NULL, NULL, NULL, NULL
+FROM merged_changes;
+"""
+
 INDEX_MIGRATIONS = (INDEX_V1, INDEX_V2, INDEX_V3)
-CHANGES_MIGRATIONS = (CHANGES_V1, CHANGES_V2)
+CHANGES_MIGRATIONS = (CHANGES_V1, CHANGES_V2, CHANGES_V3)

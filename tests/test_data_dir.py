@@ -85,22 +85,33 @@ def test_a_database_of_another_directory_is_noticed(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["index.db", "changes.db"])
-def test_a_file_that_is_no_database_is_named(tmp_path, name):
+def test_a_file_that_is_no_database_is_named_to_readers(tmp_path, name):
     Store.open_writer(tmp_path).close()
     (tmp_path / name).write_bytes(b"this is not a database, it is a text of some length" * 100)
-    for opening in (Store.open_writer, Store.open_reader):
-        with pytest.raises(DatabaseFileError, match=f"{name}: not a database"):
-            opening(tmp_path)
+    with pytest.raises(DatabaseFileError, match=f"{name}: not a database"):
+        Store.open_reader(tmp_path)
 
 
 def test_a_failed_opening_lets_the_next_writer_in(tmp_path):
     Store.open_writer(tmp_path).close()
-    whole = (tmp_path / "changes.db").read_bytes()
-    (tmp_path / "changes.db").write_bytes(b"damaged" * 1000)
-    with pytest.raises(DatabaseFileError):
+    whole = (tmp_path / "revisitd.json").read_text()
+    (tmp_path / "revisitd.json").write_text("{")
+    with pytest.raises(DataDirError):
         Store.open_writer(tmp_path)
-    (tmp_path / "changes.db").write_bytes(whole)
+    (tmp_path / "revisitd.json").write_text(whole)
     Store.open_writer(tmp_path).close()
+
+
+@pytest.mark.parametrize("kind", ["nfs4", "cifs", "fuse.sshfs"])
+def test_a_network_file_system_is_refused(tmp_path, monkeypatch, kind):
+    table = tmp_path / "mountinfo"
+    table.write_text(
+        f"1 0 8:1 / / rw,relatime - ext4 /dev/sda1 rw\n2 1 0:40 / {tmp_path}/my\\040share rw - {kind} server:/ rw\n"
+    )
+    monkeypatch.setattr("revisitd.storage.filesystem.MOUNTS", table)
+    with pytest.raises(DataDirError, match=f"network file system .{kind}.*use a local disk"):
+        Store.open_writer(tmp_path / "my share" / "data")
+    Store.open_writer(tmp_path / "data").close()
 
 
 def test_the_metadata_of_a_sensor_is_kept_as_it_was_given(tmp_path):

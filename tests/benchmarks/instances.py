@@ -71,7 +71,8 @@ def run(comparer: Comparer, job: Job, repeat: int) -> tuple[Comparison, dict[str
 def same_candidates(comparer: Comparer, job: Job) -> bool:
     """Whether both searches give the same points, both ways, of the submaps without their ground."""
     t = job.thresholds
-    submaps = [comparer.load(selection, job.range_m)[0] for selection in (job.cumulative, job.recent)]
+    chosen = [selection.only(selection.chosen) for selection in (job.cumulative, job.recent)]
+    submaps = [comparer.load(selection, job.range_m)[0] for selection in chosen]
     old, new = (detector.side_of(submap, t).standing.points for submap in submaps)
     for a, b in ((new, old), (old, new)):
         far = candidates.changed(a, b, t.tau_m, t.n)

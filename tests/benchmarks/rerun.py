@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from pathlib import Path
-from types import SimpleNamespace
 
 from revisitd.daemon.comparer import Comparer
 from revisitd.daemon.comparison import Comparison, Job
@@ -56,12 +55,19 @@ def find_scenes_again(data: Path, config: Config) -> None:
         path = store.index.trajectory()
         _, descriptors = store.index.all_descriptors(model_of(store))
         tracker = SceneTracker(config.scenes, [], store.index.next_scene_id())
-        session = SimpleNamespace(_store=store, _config=config, session_id=1, map_id=1)
+        session = _recorder(store, config)
         for i in range(len(path.scan_id)):
             xy = path.T_map_sensor[i, :2, 3]
             update = tracker.update(int(path.scan_id[i]), int(path.stamp_ns[i]), xy, descriptors[i])
-            Session.record(session, update)
-        Session.record(session, tracker.finish())
+            session.record(update)
+        session.record(tracker.finish())
+
+
+def _recorder(store: Store, config: Config) -> Session:
+    """A session that only records."""
+    session = Session.__new__(Session)
+    session._store, session._config, session.session_id, session.map_id, session._unrecorded = store, config, 1, 1, []
+    return session
 
 
 def instances_of(store: Store) -> list[Instance]:
