@@ -1,5 +1,6 @@
 """A sensor on the network -> Frames. Its packets wait in the SDK's own thread while Python is busy."""
 
+import copy
 import json
 import threading
 import time
@@ -7,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from ouster.sdk.core import LidarPacket, Packet
+from ouster.sdk.core import LidarPacket, Packet, SensorInfo
 from ouster.sdk.sensor import SensorPacketSource
 
 from .beside import read_metadata
@@ -65,7 +66,9 @@ class LiveSource(Source):
         if not self.port:
             raise BadMetadata(f"the metadata of {address} names no udp_port_lidar to listen at")
         try:
-            self._packets = SensorPacketSource(sensor_ip, sensor_info=[self._info], buffer_time_sec=BUFFER_S)
+            self._packets = SensorPacketSource(
+                sensor_ip, sensor_info=[_lidar_only(self._info)], buffer_time_sec=BUFFER_S
+            )
         except RuntimeError as error:
             raise SensorUnavailable(
                 f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
@@ -133,3 +136,10 @@ class LiveSource(Source):
         if fault:
             self.losses[fault] += 1
         return fault
+
+
+def _lidar_only(info: SensorInfo) -> SensorInfo:
+    """The same sensor, but its IMU and zone packets' ports are left to other programs."""
+    info = copy.deepcopy(info)
+    info.config.udp_port_imu = info.config.udp_port_zm = info.config.udp_port_lidar
+    return info

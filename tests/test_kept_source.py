@@ -1,50 +1,14 @@
 """A sensor is kept open through all that it and the network do, and what is wrong is stated."""
 
 import socket
-import threading
-import time
-from collections.abc import Callable
 
 import pytest
 from captures import metadata, packets, ranges_mm
 from fake_sensor import fake_sensor, free_port
+from follower import Follower
 
-from revisitd.drivers.frame import Frame
-from revisitd.drivers.kept import KeptSource, Phase, SensorState
+from revisitd.drivers.kept import Phase
 from revisitd.drivers.sensor_setup import SensorWish
-
-PATIENCE_S = 10.0
-
-
-class Follower:
-    """Follows a kept source, and collects its frames."""
-
-    def __init__(self, address: str, wish: SensorWish):
-        self.stop = threading.Event()
-        self.source = KeptSource(address, wish, self.stop, first_delay_s=0.05, longest_delay_s=0.4, silence_s=0.25)
-        self.frames: list[Frame] = []
-        self._frames = iter(self.source)
-
-    def until(self, reached: Callable[[SensorState], bool]) -> SensorState:
-        """The state once it is as wanted; a kept source must say something at least once a second."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not reached(self.source.state):
-            asked = time.monotonic()
-            frame = next(self._frames)
-            assert time.monotonic() - asked < 1, "for a second it said nothing"
-            if frame is not None:
-                self.frames.append(frame)
-            assert asked < deadline, self.source.state
-        return self.source.state
-
-    def until_running(self) -> SensorState:
-        return self.until(lambda state: state.phase is Phase.RUNNING)
-
-    def until_problem(self, part: str) -> SensorState:
-        return self.until(lambda state: part in state.problem)
-
-    def until_opened(self, times: int) -> SensorState:
-        return self.until(lambda state: state.n_opened == times)
 
 
 @pytest.fixture
@@ -57,8 +21,7 @@ def follow():
 
     yield begin
     for follower in followers:
-        follower.stop.set()
-        assert list(follower._frames) in ([], [None])
+        follower.close()
 
 
 def test_a_sensor_that_is_absent_at_first_is_waited_for(follow):

@@ -114,6 +114,13 @@ def test_a_port_that_is_taken_is_named():
             open_source(fake.address)
 
 
+def test_the_port_of_imu_packets_is_left_to_other_programs():
+    with fake_sensor() as fake, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("0.0.0.0", 0))
+        fake.document["config_params"]["udp_port_imu"] = other.getsockname()[1]
+        open_source(fake.address).close()
+
+
 def test_a_machine_without_a_sensor_is_an_error():
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
