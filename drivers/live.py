@@ -23,6 +23,7 @@ from .source import Source
 
 BUFFER_S = 1.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
 POLL_S = 0.2  # how soon a stop is noticed
+ERROR_PAUSE_S = 0.01
 USELESS_PACKETS = 64  # so many in a row that are not the sensor's as it was opened: it is another one now
 USELESS = {
     Loss.OTHER_INIT_ID: "it was restarted or reconfigured",
@@ -113,8 +114,8 @@ class LiveSource(Source):
         while not self._stop.is_set() and time.monotonic() < deadline:
             event = self._packets.get_packet(POLL_S)
             kind = event.type.name  # the SDK exports no name for the enum
-            if kind == "Error":
-                raise SensorUnavailable(f"UDP port {self.port} of sensor {self._address} cannot be read any more")
+            if kind == "Error":  # an empty datagram is one, from whomever
+                self._stop.wait(ERROR_PAUSE_S)
             if kind != "Packet":
                 continue
             fault = self._fault(event.packet())

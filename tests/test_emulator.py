@@ -116,7 +116,7 @@ def test_a_restart_is_followed_by_its_new_init_id_and_the_wish_is_set_again(sens
 
 def test_after_a_restart_the_internal_clock_begins_anew(sensor, follow):
     follower = follow(sensor.address)
-    before = follower.more_frames(1)[0]
+    before = follower.more_frames(4)[-1]
     sensor.inject(reboot_s=0.1)
     follower.until_opened(2)
     again = follower.more_frames(2)[-1]

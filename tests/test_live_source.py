@@ -50,7 +50,7 @@ def test_a_sensor_that_does_not_take_the_settings_is_an_error():
 def test_a_sensor_in_error_is_an_error():
     with fake_sensor() as fake:
         fake.document["sensor_info"]["status"] = "ERROR"
-        with pytest.raises(SensorUnavailable, match="status is ERROR"):
+        with pytest.raises(SensorUnavailable, match="status is 'ERROR'"):
             open_source(fake.address)
 
 
@@ -59,7 +59,7 @@ def test_waiting_for_a_sensor_that_warms_up_ends_when_stopped():
     stop.set()
     with fake_sensor() as fake:
         fake.document["sensor_info"]["status"] = "WARMUP"
-        with pytest.raises(SensorUnavailable, match="status is WARMUP"):
+        with pytest.raises(SensorUnavailable, match="status is 'WARMUP'"):
             open_source(fake.address, stop=stop)
 
 
