@@ -11,10 +11,12 @@ from urllib.error import HTTPError
 import numpy as np
 import pytest
 from captures import IMU_PORT, PERIOD_NS, Pcap, metadata, packets, ranges_mm
+from click.testing import CliRunner
 from emulated import emulated
 from fake_sensor import free_port
 from follower import Follower
 
+from revisitd.daemon.cli import cli
 from revisitd.drivers import faults, sensor_setup
 from revisitd.drivers.kept import Phase
 from revisitd.drivers.losses import Loss
@@ -239,6 +241,16 @@ def test_a_capture_that_is_not_looped_ends_the_program(capture, tmp_path):
         timeout=30,
     )
     assert result.returncode == 0 and result.stdout.startswith("sensor at 127.0.0.1:") and not result.stderr
+
+
+def test_a_taken_port_is_one_clear_line(capture, sensor):
+    port = sensor.address.rpartition(":")[2]
+    result = CliRunner().invoke(cli, ["emulate", str(capture), "--http-port", port])
+    assert result.exit_code == 69
+    assert result.output == (
+        f"Error: no sensor can be at http://127.0.0.1:{port} (Address already in use): "
+        "give another --http-port or --host\n"
+    )
 
 
 def test_faults_that_do_not_exist_are_refused(sensor):

@@ -30,6 +30,9 @@ def test_a_sensor_that_is_absent_at_first_is_waited_for(follow):
     follower = follow(address)
     state = follower.until_problem("no sensor answers")
     assert state.phase is Phase.WAITING and state.sensor is None and state.n_opened == 0
+    for phase in (Phase.CONNECTING, Phase.WAITING, Phase.CONNECTING, Phase.WAITING):
+        again = follower.until(lambda state, phase=phase: state.phase is phase)
+        assert (again.problem, again.since_ns) == (state.problem, state.since_ns), "each attempt is no news"
 
 
 def test_frames_come_as_they_are_sent_and_the_state_says_so(follow):
@@ -95,3 +98,21 @@ def test_the_wish_is_set_on_the_sensor(follow):
         assert state.sensor.timestamp_mode == "TIME_FROM_PTP_1588"
         fake.send(packets(metadata(), range(1)))
         follower.until_running()
+
+
+def test_a_flood_of_bad_packets_is_one_line_in_the_log(follow, caplog, capfd):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        fake.send(packets(fake.document, range(1)))
+        follower.until_running()
+        caplog.clear()
+        before = dict(fake.document["sensor_info"])
+        fake.document["sensor_info"]["prod_sn"] = "999"
+        flood = packets(fake.document, range(1, 5))
+        fake.document["sensor_info"] = before
+        fake.send(flood)
+        follower.until_problem("what comes is of another sensor")
+        follower.until_opened(2)
+    assert len(caplog.records) == 1
+    assert capfd.readouterr().err == ""
