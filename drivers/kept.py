@@ -22,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 TICK_S = 0.2  # how often None is yielded while there is no frame
 FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 30.0
+OPENING_TIMEOUT_S = 120.0  # of which it may spin up for a minute
 SILENCE_S = 2.0  # twenty frames missing: ask the sensor why
 
 
@@ -96,12 +97,13 @@ class KeptSource:
         opening = _in_background(
             lambda: LiveSource(self._address, stop=self._stop, wish=self._wish, losses=self.losses)
         )
+        deadline_s = time.monotonic() + OPENING_TIMEOUT_S
         while not opening.done():
             yield None
             wait([opening], TICK_S)
-            if self._stop.is_set():
+            if self._stop.is_set() or time.monotonic() > deadline_s:
                 opening.add_done_callback(_close)
-                raise SensorUnavailable("stopped")
+                raise SensorUnavailable(f"sensor {self._address} was not opened within {OPENING_TIMEOUT_S:g} s")
         live = opening.result()
         self.state = replace(self.state, n_opened=self.state.n_opened + 1, sensor=live.sensor)
         return live

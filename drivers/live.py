@@ -1,5 +1,6 @@
 """A sensor on the network -> Frames. Its packets wait in the SDK's own thread while Python is busy."""
 
+import copy
 import json
 import threading
 import time
@@ -7,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from ouster.sdk.core import LidarPacket, Packet
+from ouster.sdk.core import LidarPacket, Packet, SensorInfo
 from ouster.sdk.sensor import SensorPacketSource
 
 from .beside import read_metadata
@@ -22,6 +23,7 @@ from .source import Source
 
 BUFFER_S = 1.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
 POLL_S = 0.2  # how soon a stop is noticed
+ERROR_PAUSE_S = 0.01
 USELESS_PACKETS = 64  # so many in a row that are not the sensor's as it was opened: it is another one now
 USELESS = {
     Loss.OTHER_INIT_ID: "it was restarted or reconfigured",
@@ -65,7 +67,9 @@ class LiveSource(Source):
         if not self.port:
             raise BadMetadata(f"the metadata of {address} names no udp_port_lidar to listen at")
         try:
-            self._packets = SensorPacketSource(sensor_ip, sensor_info=[self._info], buffer_time_sec=BUFFER_S)
+            self._packets = SensorPacketSource(
+                sensor_ip, sensor_info=[_lidar_only(self._info)], buffer_time_sec=BUFFER_S
+            )
         except RuntimeError as error:
             raise SensorUnavailable(
                 f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
@@ -110,8 +114,8 @@ class LiveSource(Source):
         while not self._stop.is_set() and time.monotonic() < deadline:
             event = self._packets.get_packet(POLL_S)
             kind = event.type.name  # the SDK exports no name for the enum
-            if kind == "Error":
-                raise SensorUnavailable(f"UDP port {self.port} of sensor {self._address} cannot be read any more")
+            if kind == "Error":  # an empty datagram is one, from whomever
+                self._stop.wait(ERROR_PAUSE_S)
             if kind != "Packet":
                 continue
             fault = self._fault(event.packet())
@@ -133,3 +137,10 @@ class LiveSource(Source):
         if fault:
             self.losses[fault] += 1
         return fault
+
+
+def _lidar_only(info: SensorInfo) -> SensorInfo:
+    """The same sensor, but its IMU and zone packets' ports are left to other programs."""
+    info = copy.deepcopy(info)
+    info.config.udp_port_imu = info.config.udp_port_zm = info.config.udp_port_lidar
+    return info

@@ -20,6 +20,7 @@ UNUSED_PARTS = ("user_data", "zone_set", "ouster-sdk")
 # The SDK's patterns crash the process on a long string; nothing in a sensor's metadata comes near.
 MAX_TEXT = 500
 MAX_DEPTH = 8
+FORMAT_SECTIONS = ("data_format", "lidar_data_format", "imu_data_format")
 STATED_GEOMETRY = (
     "beam_altitude_angles",
     "beam_azimuth_angles",
@@ -54,6 +55,8 @@ def parse_metadata(json_text: str) -> core.SensorInfo:
     used = {key: value for key, value in document.items() if key not in UNUSED_PARTS}
     if not _is_digestible(used):
         raise BadMetadata("metadata is malformed: it holds a text, list or nesting that is far too long")
+    if huge := _huge_entry(used):
+        raise BadMetadata(f"metadata is malformed: {huge}")
     try:
         info = core.SensorInfo(json.dumps(used, ensure_ascii=False))
         fault = _fault(info) or _replaced_entry(used, info)
@@ -110,6 +113,16 @@ def _is_digestible(value: object, depth: int = 0) -> bool:
     return not isinstance(value, str) or len(value) <= MAX_TEXT
 
 
+def _huge_entry(document: dict) -> str | None:
+    """An entry by which the SDK would count, or reserve memory, for minutes."""
+    for section in FORMAT_SECTIONS:
+        entries = document.get(section)
+        for name, value in entries.items() if isinstance(entries, dict) else ():
+            if isinstance(value, (int, float)) and not abs(value) <= MAX_COLUMNS:
+                return f"{name} is {value}"
+    return None
+
+
 def _fault(info: core.SensorInfo) -> str | None:
     """What makes this metadata useless, or None."""
     data = info.format
@@ -154,7 +167,7 @@ def _transform_fault(info: core.SensorInfo) -> str | None:
 def _replaced_entry(document: dict, info: core.SensorInfo) -> str | None:
     """An entry that is there, but wrong in a way for which the SDK puts its own default in silence."""
     stated = dict(document)
-    for section in ("beam_intrinsics", "lidar_intrinsics", "data_format", "lidar_data_format"):
+    for section in ("beam_intrinsics", "lidar_intrinsics", *FORMAT_SECTIONS):
         if isinstance(document.get(section), dict):
             stated |= document[section]
     for holder, names in ((info, STATED_GEOMETRY), (info.format, STATED_FORMAT)):

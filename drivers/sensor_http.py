@@ -6,9 +6,9 @@ Not by the SDK, whose calls hold the GIL until the sensor answers: a slow one wo
 import json
 import socket
 import time
-from http.client import HTTPException, HTTPResponse
-from urllib.error import HTTPError, URLError
-from urllib.request import ProxyHandler, Request, build_opener
+from http import HTTPStatus
+from http.client import HTTPException, HTTPResponse, responses
+from urllib.request import HTTPErrorProcessor, ProxyHandler, Request, build_opener
 
 from .errors import SensorRefused, SensorUnavailable
 
@@ -29,7 +29,7 @@ class SensorHttp:
     def __init__(self, address: str):
         self.address = address
         # A sensor is on the local network: a proxy from the environment would only misroute the requests.
-        self._opener = build_opener(ProxyHandler({}))
+        self._opener = build_opener(ProxyHandler({}), _NoErrors)
 
     def metadata(self) -> dict:
         """Raises SensorUnavailable where no Ouster sensor answers."""
@@ -45,23 +45,19 @@ class SensorHttp:
         Raises SensorRefused with what the sensor says of a value that it does not take.
         """
         path = f"{CONFIG}?reinit=true&persist={str(persist).lower()}"
-        try:
-            self._request(path, json.dumps(params).encode())
-        except HTTPError as error:
-            with error:
-                said = " ".join(_read(error)[:SHOWN_BYTES].decode("utf-8", "replace").split())
-            raise SensorRefused(f"sensor {self.address} refuses {params}: {error.code} {said}") from None
+        status, text = self._request(path, json.dumps(params).encode())
+        if status != HTTPStatus.OK:
+            said = " ".join(text[:SHOWN_BYTES].decode("utf-8", "replace").split())
+            raise SensorRefused(f"sensor {self.address} refuses {params}: {status} {said}")
 
     def get(self, path: str) -> dict:
         """A JSON object that the sensor tells of itself. Raises SensorUnavailable where there is none."""
-        try:
-            text = self._request(path)
-        except HTTPError as error:
-            error.close()
+        status, text = self._request(path)
+        if status != HTTPStatus.OK:
             raise SensorUnavailable(
-                f"http://{self.address}/{path} answers {error.code} {error.reason}: "
+                f"http://{self.address}/{path} answers {status} {responses.get(status, '')}: "
                 "no Ouster sensor, or firmware before 3.1"
-            ) from None
+            )
         try:
             answer = json.loads(text)
         except (ValueError, RecursionError):
@@ -70,20 +66,25 @@ class SensorHttp:
             raise SensorUnavailable(f"http://{self.address}/{path} does not answer with JSON: no Ouster sensor")
         return answer
 
-    def _request(self, path: str, body: bytes | None = None) -> bytes:
-        """The answer; raises HTTPError where it is one of failure."""
+    def _request(self, path: str, body: bytes | None = None) -> tuple[int, bytes]:
+        """HTTP status and the answer."""
         url = f"http://{self.address}/{path}"
-        request = Request(url, data=body, headers={"Content-Type": "application/json"})
         try:
+            request = Request(url, data=body, headers={"Content-Type": "application/json"})
             with self._opener.open(request, timeout=REQUEST_TIMEOUT_S) as response:
-                return _read(response)
-        except HTTPError:
-            raise
-        except (URLError, OSError, HTTPException, ValueError) as error:
+                return response.status, _read(response)
+        except (OSError, HTTPException, ValueError) as error:
             reason = getattr(error, "reason", error)
             raise SensorUnavailable(
                 f"no sensor answers at http://{self.address} ({reason}): check its power, cable and address"
             ) from None
+
+
+class _NoErrors(HTTPErrorProcessor):
+    """Gives answers of failure as any other: they say what is wrong."""
+
+    def http_response(self, request: Request, response: HTTPResponse) -> HTTPResponse:
+        return response
 
 
 def resolve(address: str) -> tuple[str, str]:
@@ -93,7 +94,9 @@ def resolve(address: str) -> tuple[str, str]:
     """
     host = host_of(address)
     try:
-        family, _, _, _, target = socket.getaddrinfo(host, 7502, type=socket.SOCK_DGRAM)[0]
+        # IPv4 where there is both: an address that only counts on one network card means nothing to the sensor.
+        found = socket.getaddrinfo(host, 7502, type=socket.SOCK_DGRAM)
+        family, _, _, _, target = min(found, key=lambda entry: entry[0] != socket.AF_INET)
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect(target)  # sends nothing
             return target[0], probe.getsockname()[0]

@@ -13,6 +13,7 @@ logger = logging.getLogger(__name__)
 
 READY_TIMEOUT_S = 60.0  # a sensor that was switched to NORMAL spins up first
 POLL_S = 0.5
+LONGEST_SHOWN = 60
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def prepare_sensor(sensor: SensorHttp, wish: SensorWish, our_address: str, stop:
     deadline = time.monotonic() + READY_TIMEOUT_S
     while (status := metadata["sensor_info"].get("status")) != "RUNNING":
         if status == "ERROR" or time.monotonic() > deadline or stop.wait(POLL_S):
-            raise SensorUnavailable(f"sensor {sensor.address} does not run: its status is {status}")
+            raise SensorUnavailable(f"sensor {sensor.address} does not run: its status is {_shown(status)}")
         metadata = sensor.metadata()
     left = _differing(metadata["config_params"], wanted)
     if left:
@@ -83,7 +84,7 @@ def require_unchanged(sensor: SensorHttp, wish: SensorWish, our_address: str, in
         )
     status = info.get("status")
     if status != "RUNNING" or info.get("initialization_id", init_id) != init_id:
-        raise SensorChanged(f"sensor {sensor.address} was restarted or reconfigured: its status is {status}")
+        raise SensorChanged(f"sensor {sensor.address} was restarted or reconfigured: its status is {_shown(status)}")
 
 
 def _differing(config: dict, wanted: dict) -> dict:
@@ -103,4 +104,9 @@ def _is_shared(destination: object) -> bool:
 
 
 def _listed(params: dict) -> str:
-    return ", ".join(f"{name} = {value!r}" for name, value in params.items())
+    return ", ".join(f"{name} = {_shown(value)}" for name, value in params.items())
+
+
+def _shown(value: object) -> str:
+    """What a sensor says, or whatever answers in its place, as a part of a line."""
+    return repr(value)[:LONGEST_SHOWN]

@@ -67,9 +67,9 @@ def _number(value: object, unit: float) -> float | None:
 
 
 def _alert(alert: object) -> str:
-    if not isinstance(alert, dict):
-        return str(alert)[:LONGEST_ALERT]
-    return f"{alert.get('level')} {alert.get('id')}: {alert.get('msg')}"[:LONGEST_ALERT]
+    if isinstance(alert, dict):
+        alert = f"{alert.get('level')} {alert.get('id')}: {alert.get('msg')}"
+    return " ".join(str(alert).split())[:LONGEST_ALERT]
 
 
 def _is_synced(clock: dict) -> bool | None:

@@ -2,10 +2,13 @@
 
 import json
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 from captures import COLUMNS, HOST_NS, PERIOD_NS, START_NS, metadata, ranges_mm
 
+from revisitd.daemon import pipeline
+from revisitd.daemon.config import Config
 from revisitd.drivers.frame import Frame
 from revisitd.drivers.gate import FrameGate, Rejection
 from revisitd.drivers.ouster import sensor_from_metadata
@@ -102,3 +105,25 @@ def test_a_restarted_sensor_begins_a_new_time_at_once():
     rejections, interruptions = verdicts([frame(0), frame(1), frame(0, sensor=restarted), frame(1, sensor=restarted)])
     assert rejections == [None] * 4
     assert interruptions == ["0: the sensor was restarted, reconfigured, or is another one"]
+
+
+def test_a_step_of_the_clock_ends_the_session_and_begins_another(monkeypatch):
+    sessions = []
+
+    def start(*_arguments) -> MagicMock:
+        session = MagicMock(session_id=len(sessions) + 1)
+        session.odometry.register.return_value.health.lost = False
+        session.key_scans.wants.return_value = False
+        session.record.return_value = []
+        sessions.append(session)
+        return session
+
+    monkeypatch.setattr(pipeline, "Session", start)
+    store = MagicMock()
+    store.index.maps_to_join.return_value = []
+    line = pipeline.Pipeline(Config(), store, None, None, None, None, "os1", wait=False)
+    for one in [frame(0), frame(1), *(frame(index, step_ns=37 * NS) for index in range(2, 6))]:
+        line.process(one)
+    first, second = ([call.args[0].frame_id for call in s.odometry.register.call_args_list] for s in sessions)
+    assert (first, second) == ([0, 1], [4, 5])
+    store.index.end_session.assert_called_once_with(1)

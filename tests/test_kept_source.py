@@ -1,50 +1,14 @@
 """A sensor is kept open through all that it and the network do, and what is wrong is stated."""
 
 import socket
-import threading
-import time
-from collections.abc import Callable
 
 import pytest
 from captures import metadata, packets, ranges_mm
 from fake_sensor import fake_sensor, free_port
+from follower import Follower
 
-from revisitd.drivers.frame import Frame
-from revisitd.drivers.kept import KeptSource, Phase, SensorState
+from revisitd.drivers.kept import Phase
 from revisitd.drivers.sensor_setup import SensorWish
-
-PATIENCE_S = 10.0
-
-
-class Follower:
-    """Follows a kept source, and collects its frames."""
-
-    def __init__(self, address: str, wish: SensorWish):
-        self.stop = threading.Event()
-        self.source = KeptSource(address, wish, self.stop, first_delay_s=0.05, longest_delay_s=0.4, silence_s=0.25)
-        self.frames: list[Frame] = []
-        self._frames = iter(self.source)
-
-    def until(self, reached: Callable[[SensorState], bool]) -> SensorState:
-        """The state once it is as wanted; a kept source must say something at least once a second."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not reached(self.source.state):
-            asked = time.monotonic()
-            frame = next(self._frames)
-            assert time.monotonic() - asked < 1, "for a second it said nothing"
-            if frame is not None:
-                self.frames.append(frame)
-            assert asked < deadline, self.source.state
-        return self.source.state
-
-    def until_running(self) -> SensorState:
-        return self.until(lambda state: state.phase is Phase.RUNNING)
-
-    def until_problem(self, part: str) -> SensorState:
-        return self.until(lambda state: part in state.problem)
-
-    def until_opened(self, times: int) -> SensorState:
-        return self.until(lambda state: state.n_opened == times)
 
 
 @pytest.fixture
@@ -57,8 +21,7 @@ def follow():
 
     yield begin
     for follower in followers:
-        follower.stop.set()
-        assert list(follower._frames) in ([], [None])
+        follower.close()
 
 
 def test_a_sensor_that_is_absent_at_first_is_waited_for(follow):
@@ -67,6 +30,9 @@ def test_a_sensor_that_is_absent_at_first_is_waited_for(follow):
     follower = follow(address)
     state = follower.until_problem("no sensor answers")
     assert state.phase is Phase.WAITING and state.sensor is None and state.n_opened == 0
+    for phase in (Phase.CONNECTING, Phase.WAITING, Phase.CONNECTING, Phase.WAITING):
+        again = follower.until(lambda state, phase=phase: state.phase is phase)
+        assert (again.problem, again.since_ns) == (state.problem, state.since_ns), "each attempt is no news"
 
 
 def test_frames_come_as_they_are_sent_and_the_state_says_so(follow):
@@ -132,3 +98,21 @@ def test_the_wish_is_set_on_the_sensor(follow):
         assert state.sensor.timestamp_mode == "TIME_FROM_PTP_1588"
         fake.send(packets(metadata(), range(1)))
         follower.until_running()
+
+
+def test_a_flood_of_bad_packets_is_one_line_in_the_log(follow, caplog, capfd):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        fake.send(packets(fake.document, range(1)))
+        follower.until_running()
+        caplog.clear()
+        before = dict(fake.document["sensor_info"])
+        fake.document["sensor_info"]["prod_sn"] = "999"
+        flood = packets(fake.document, range(1, 5))
+        fake.document["sensor_info"] = before
+        fake.send(flood)
+        follower.until_problem("what comes is of another sensor")
+        follower.until_opened(2)
+    assert len(caplog.records) == 1
+    assert capfd.readouterr().err == ""

@@ -50,7 +50,7 @@ def test_a_sensor_that_does_not_take_the_settings_is_an_error():
 def test_a_sensor_in_error_is_an_error():
     with fake_sensor() as fake:
         fake.document["sensor_info"]["status"] = "ERROR"
-        with pytest.raises(SensorUnavailable, match="status is ERROR"):
+        with pytest.raises(SensorUnavailable, match="status is 'ERROR'"):
             open_source(fake.address)
 
 
@@ -59,7 +59,7 @@ def test_waiting_for_a_sensor_that_warms_up_ends_when_stopped():
     stop.set()
     with fake_sensor() as fake:
         fake.document["sensor_info"]["status"] = "WARMUP"
-        with pytest.raises(SensorUnavailable, match="status is WARMUP"):
+        with pytest.raises(SensorUnavailable, match="status is 'WARMUP'"):
             open_source(fake.address, stop=stop)
 
 
@@ -112,6 +112,13 @@ def test_a_port_that_is_taken_is_named():
         other.bind(("0.0.0.0", fake.document["config_params"]["udp_port_lidar"]))
         with pytest.raises(SensorUnavailable, match=r"cannot listen at UDP port \d+ .* another program"):
             open_source(fake.address)
+
+
+def test_the_port_of_imu_packets_is_left_to_other_programs():
+    with fake_sensor() as fake, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("0.0.0.0", 0))
+        fake.document["config_params"]["udp_port_imu"] = other.getsockname()[1]
+        open_source(fake.address).close()
 
 
 def test_a_machine_without_a_sensor_is_an_error():

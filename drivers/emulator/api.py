@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from urllib.parse import parse_qs, urlsplit
 
+from ..errors import SensorUnavailable
 from .device import PTP, Device, Refused
 
 API = "/api/v1/"
@@ -33,8 +34,13 @@ class Api:
         return f"{self._host}:{self._port}"
 
     def start(self) -> None:
-        """Listens; raises OSError where the port is taken."""
-        self._server = ThreadingHTTPServer((self._host, self._port), _handler(self))
+        """Listens. Raises SensorUnavailable where the port is taken, or the address is not one of this machine."""
+        try:
+            self._server = ThreadingHTTPServer((self._host, self._port), _handler(self))
+        except OSError as error:
+            raise SensorUnavailable(
+                f"no sensor can be at http://{self.address} ({error.strerror}): give another --http-port or --host"
+            ) from None
         threading.Thread(target=self._server.serve_forever, args=(POLL_S,), name="sensor HTTP", daemon=True).start()
 
     def stop(self) -> None:

@@ -141,7 +141,9 @@ class Device:
         columns = int(self.config["lidar_mode"].partition("x")[0])
         recorded = self._recorded_format
         if self.config["azimuth_window"] == self.recorded["azimuth_window"]:
-            window = [column * columns // recorded["columns_per_frame"] for column in recorded["column_window"]]
+            first, last = recorded["column_window"]
+            was = recorded["columns_per_frame"]
+            window = [first * columns // was, (last + 1) * columns // was - 1]
         else:
             window = _column_window(self.config["azimuth_window"], columns)
         shifts = [round(shift * columns / recorded["columns_per_frame"]) for shift in recorded["pixel_shift_by_row"]]

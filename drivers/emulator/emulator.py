@@ -36,8 +36,8 @@ class Emulator:
     """A sensor made of a capture. host: its address here; http_port: 0 for any that is free.
 
     loop: plays the capture again and again. rate: times real time. serial: another than the capture's. warmup_s:
-    until a new configuration holds. seed: of the random faults. Raises DriverError for the capture, OSError for
-    the port.
+    until a new configuration holds. seed: of the random faults. Raises DriverError for what cannot be played, or
+    where.
     """
 
     def __init__(
