@@ -13,6 +13,7 @@ COMPLAINTS = {
     Loss.OTHER_INIT_ID: "packets come from before the sensor's last restart, or of another sensor with its serial",
     Loss.WRONG_SIZE: "packets of another profile or sender come to the same UDP port",
     Loss.WRONG_COLUMN: "packets of another lidar mode come to the same UDP port",
+    Loss.SKIPPED_FRAME: "frames are skipped, as this machine is too slow for the sensor",
     Loss.OVERFLOW: "packets are dropped, as this machine is too slow for the sensor",
 }
 

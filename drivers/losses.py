@@ -20,6 +20,7 @@ class Loss(str, Enum):
     IMU_PACKET = "IMU packet"  # not used
     ZONE_PACKET = "zone packet"  # not used
     OVERFLOW = "packet buffer full"  # the program was too slow for a live sensor
+    SKIPPED_FRAME = "frame skipped"  # whole, but the program was still busy with earlier ones
     LATE_PACKET = "late packet"  # came after its frame was finished
     RESTARTED = "frame ids restarted"  # a looped or joined capture: a new frame is begun
     EMPTY_FRAME = "frame without columns"
