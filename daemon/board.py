@@ -29,6 +29,7 @@ logger = logging.getLogger(__name__)
 
 EVERY_S = 1.0
 RATE_S = 10.0  # over which the frame rate and the losses are told
+SLOW = 0.8  # of the sensor's rate: less is worth a word
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -178,8 +179,12 @@ def _line(
         return "waiting", f"no usable frame yet, {figures}"
     if place.odometry != "good":
         return "lost", f"odometry lost ({place.odometry}), {figures}"
-    if sensor.problem or store.problem:
-        return "degraded", f"{sensor.problem or store.problem}, {figures}"
+    problem = sensor.problem or store.problem
+    wanted_hz = float(sensor.mode.partition("x")[2] or 0)
+    if not problem and frames.hz < SLOW * wanted_hz:
+        problem = f"only {frames.hz:.1f} of {wanted_hz:.0f} Hz are used"
+    if problem:
+        return "degraded", f"{problem}, {figures}"
     return "running", f"good {figures}"
 
 
