@@ -16,12 +16,13 @@ from .errors import BadMetadata, SensorChanged, SensorUnavailable
 from .frame import Frame
 from .losses import Loss
 from .metadata import parse_metadata, sensor_from_info
-from .packets import FrameAssembler, PacketFilter
+from .packets import FrameAssembler, PacketFilter, packets_per_frame
 from .sensor_http import SensorHttp, resolve
 from .sensor_setup import AS_IT_IS, SensorWish, prepare_sensor
 from .source import Source
 
-BUFFER_S = 1.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
+BUFFER_S = 2.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
+BACKLOG_S = 1.0  # of packets that wait; beyond, whole frames are skipped: odometry does well with every second one
 POLL_S = 0.2  # how soon a stop is noticed
 ERROR_PAUSE_S = 0.01
 USELESS_PACKETS = 64  # so many in a row that are not the sensor's as it was opened: it is another one now
@@ -75,6 +76,8 @@ class LiveSource(Source):
                 f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
             ) from None
         self._overflown = self._useless = 0
+        self._frame_id = self._skipped_id = -1  # of the last packet; of the frame that is left out
+        self._packets_per_s = packets_per_frame(self._info) * self._info.format.fps
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self.listen():
@@ -93,6 +96,8 @@ class LiveSource(Source):
             now = time.monotonic()
             if packet is not None:
                 heard = now
+                if self._is_skipped(packet.frame_id()):
+                    continue
                 for lidar_frame in assembler.add(packet):
                     told = now
                     yield from self._frames(lidar_frame)
@@ -105,8 +110,22 @@ class LiveSource(Source):
                 told = now
                 yield None
 
+    @property
+    def backlog_s(self) -> float:
+        """Seconds of packets that have come and wait to be read."""
+        return self._packets.buffer_size() / self._packets_per_s
+
     def close(self) -> None:
         self._packets.close()
+
+    def _is_skipped(self, frame_id: int) -> bool:
+        """Whether the frame is left out to catch up: decided at its first packet, so that the others are whole."""
+        if frame_id != self._frame_id:
+            self._frame_id = frame_id
+            if self.backlog_s > BACKLOG_S:
+                self._skipped_id = frame_id
+                self.losses[Loss.SKIPPED_FRAME] += 1
+        return frame_id == self._skipped_id
 
     def _next_packet(self) -> LidarPacket | None:
         """The next packet that is of use, None where none comes within about POLL_S."""
