@@ -21,8 +21,9 @@ from .sensor_http import SensorHttp, resolve
 from .sensor_setup import AS_IT_IS, SensorWish, prepare_sensor
 from .source import Source
 
-BUFFER_S = 2.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
+BUFFER_S = 3.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
 BACKLOG_S = 1.0  # of packets that wait; beyond, whole frames are skipped: odometry does well with every second one
+MOST_SKIPPED = 4  # in a row: over longer gaps the odometry is lost
 POLL_S = 0.2  # how soon a stop is noticed
 ERROR_PAUSE_S = 0.01
 USELESS_PACKETS = 64  # so many in a row that are not the sensor's as it was opened: it is another one now
@@ -76,7 +77,8 @@ class LiveSource(Source):
                 f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
             ) from None
         self._overflown = self._useless = 0
-        self._frame_id = self._skipped_id = -1  # of the last packet; of the frame that is left out
+        self._frame_id = -1  # of the last packet
+        self._skipping, self._n_skipped = False, 0  # that frame, and so many in a row
         self._packets_per_s = packets_per_frame(self._info) * self._info.format.fps
 
     def __iter__(self) -> Iterator[Frame]:
@@ -122,10 +124,10 @@ class LiveSource(Source):
         """Whether the frame is left out to catch up: decided at its first packet, so that the others are whole."""
         if frame_id != self._frame_id:
             self._frame_id = frame_id
-            if self.backlog_s > BACKLOG_S:
-                self._skipped_id = frame_id
-                self.losses[Loss.SKIPPED_FRAME] += 1
-        return frame_id == self._skipped_id
+            self._skipping = self.backlog_s > BACKLOG_S and self._n_skipped < MOST_SKIPPED
+            self._n_skipped = self._n_skipped + 1 if self._skipping else 0
+            self.losses[Loss.SKIPPED_FRAME] += self._skipping
+        return self._skipping
 
     def _next_packet(self) -> LidarPacket | None:
         """The next packet that is of use, None where none comes within about POLL_S."""
