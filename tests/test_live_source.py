@@ -49,6 +49,19 @@ def test_a_sensor_that_does_not_take_the_settings_is_an_error():
             open_source(fake.address)
 
 
+def test_a_sensor_that_refuses_the_settings_is_quoted():
+    with fake_sensor(config_params__udp_dest="10.5.5.77") as fake:
+        fake.answers_post = 403
+        with pytest.raises(SensorUnavailable, match="refuses {'udp_dest': '127.0.0.1'}: 403 {}"):
+            open_source(fake.address)
+
+
+def test_a_sensor_that_takes_the_settings_without_a_word_is_believed():
+    with fake_sensor(config_params__udp_dest="10.5.5.77") as fake:
+        fake.answers_post = 202
+        open_source(fake.address).close()
+
+
 def test_a_sensor_in_error_is_an_error():
     with fake_sensor() as fake:
         fake.document["sensor_info"]["status"] = "ERROR"
