@@ -32,7 +32,7 @@ class Phase(str, Enum):
     CONNECTING = "connecting"  # it is asked, set, and listened for
     WAITING = "waiting"  # the next attempt is due in a while
     RUNNING = "running"
-    SILENT = "silent"  # it is open, but nothing comes
+    SILENT = "silent"  # it is open, but no frame comes
 
     def __str__(self) -> str:
         return self.value
@@ -116,11 +116,12 @@ class KeptSource:
             if frame is not None:
                 if self.state.phase is not Phase.RUNNING:
                     inquiry = self._inquiry(live)
-                heard_s = time.monotonic()
                 self._tell(Phase.RUNNING, faults.problem())
             elif time.monotonic() - heard_s > self._silence_s:
-                self._tell(Phase.SILENT, inquiry.problem())
+                self._tell(Phase.SILENT, faults.problem() or inquiry.problem())
             yield frame
+            if frame is not None:
+                heard_s = time.monotonic()  # only now: a reader may take long for a frame
 
     def _inquiry(self, live: LiveSource) -> "_Inquiry":
         sensor, init_id = SensorHttp(self._address), live.sensor.init_id

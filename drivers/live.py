@@ -92,25 +92,22 @@ class LiveSource(Source):
         Raises SensorChanged where what comes is not of the sensor as it was opened.
         """
         assembler = FrameAssembler(self._info, self.losses)
-        heard = told = time.monotonic()
+        heard = told = time.monotonic()  # the time that the reader takes for a frame is not ours
         while not self._stop.is_set():
             packet = self._next_packet()
-            now = time.monotonic()
             if packet is not None:
-                heard = now
-                if self._is_skipped(packet.frame_id()):
-                    continue
-                for lidar_frame in assembler.add(packet):
-                    told = now
+                heard = time.monotonic()
+                for lidar_frame in () if self._is_skipped(packet.frame_id()) else assembler.add(packet):
                     yield from self._frames(lidar_frame)
-            elif self._timeout_s and now - heard > self._timeout_s:
+                    told = time.monotonic()
+            elif self._timeout_s and time.monotonic() - heard > self._timeout_s:
                 raise SensorUnavailable(
                     f"sensor {self._address} has sent nothing to UDP port {self.port} for "
                     f"{self._timeout_s:g} s: check its udp_dest and the firewall"
                 )
-            if now - told >= POLL_S:
-                told = now
+            if time.monotonic() - told >= POLL_S:
                 yield None
+                told = time.monotonic()
 
     @property
     def backlog_s(self) -> float:

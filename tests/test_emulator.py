@@ -193,6 +193,15 @@ def test_checksum_failures_are_counted_and_named_and_go_away(sensor, follow):
     follower.until(lambda state: state.problem == "")
 
 
+def test_a_stream_of_nothing_but_damaged_packets_is_named_as_such(sensor, follow):
+    follower = follow(sensor.address)
+    follower.more_frames(2)
+    sensor.inject(corrupt=1.0)
+    follower.until(lambda state: state.phase is Phase.SILENT and "fail their checksum" in state.problem)
+    sensor.inject(corrupt=0.0)
+    follower.until(lambda state: state.phase is Phase.RUNNING and not state.problem)
+
+
 def test_packets_of_another_sensor_are_left_out_and_named(capture, sensor, follow):
     with emulated(capture, "--serial", "999") as other:
         port = free_port()
