@@ -65,7 +65,7 @@ class LiveSource(Source):
         self._info = parse_metadata(text)
         self.sensor = sensor_from_info(self._info, text)
         self._filter = PacketFilter(self._info)
-        self.port = self._filter.port
+        self.port, self.has_ids = self._filter.port, self._filter.has_ids
         if not self.port:
             raise BadMetadata(f"the metadata of {address} names no udp_port_lidar to listen at")
         try:

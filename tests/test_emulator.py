@@ -17,7 +17,7 @@ from fake_sensor import free_port
 from follower import Follower
 
 from revisitd.daemon.cli import cli
-from revisitd.drivers import faults, sensor_setup
+from revisitd.drivers import faults, kept, sensor_setup
 from revisitd.drivers.kept import Phase
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.sensor_setup import SensorWish
@@ -156,6 +156,16 @@ def test_another_profile_and_mode_set_by_someone_else_are_followed(sensor, follo
     assert (frame.sensor.profile, frame.sensor.mode) == ("RNG15_RFL8_NIR8", "1024x10")
     # Twice as many columns: each of the recording is there twice.
     assert any((frame.range_mm == np.repeat(ranges_mm(index), 2, axis=1)).all() for index in range(N_FRAMES))
+
+
+def test_another_mode_is_followed_where_packets_carry_no_ids(sensor, follow, monkeypatch):
+    monkeypatch.setattr(kept, "RECHECK_S", 0.1)
+    sensor.configure(udp_profile_lidar="LEGACY", lidar_mode="1024x10")
+    follower = follow(sensor.address)
+    follower.more_frames(2)
+    sensor.configure(lidar_mode="512x10")  # the packets are as before, only fewer
+    follower.until_opened(2)
+    assert follower.more_frames(2)[-1].valid_ratio == 1
 
 
 def test_what_is_wished_is_set_again_when_someone_else_changes_it(sensor, follow):
