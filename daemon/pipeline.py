@@ -192,7 +192,14 @@ class Pipeline:
         maps = self._store.index.maps_to_join()
         self._joiner = Joiner(self._ask_where, maps, self._config.alignment, self._wait) if maps else None
         self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source)
-        logger.info("session %d starts sensor=%s", self._session.session_id, frame.sensor.serial)
+        sensor = frame.sensor
+        logger.info(
+            "session %d starts sensor=%s clock=%s host_ahead_s=%.3f",
+            self._session.session_id,
+            sensor.serial,
+            sensor.timestamp_mode,
+            frame.clock_offset_ns * 1e-9,
+        )
         return self._session
 
     def _ask_where(self, question: Question) -> Future[Answer]:

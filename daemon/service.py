@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 from ..drivers.kept import KeptSource
-from ..drivers.latest import LatestFrames
 from .board import StatusBoard
 from .config import Config, load_config
 from .notify import notify, notify_reloading, watchdog_interval_s
@@ -52,7 +51,7 @@ class Service:
     def _loop(self, program: Program, source: KeptSource, board: StatusBoard) -> None:
         watchdog = _Watchdog(program, self._config.worker.timeout_s)
         heard = time.monotonic()
-        for frame in LatestFrames(source, source.losses):
+        for frame in source:
             if frame is not None:
                 program.pipeline.process(frame)
                 heard = time.monotonic()

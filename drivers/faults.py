@@ -6,7 +6,7 @@ from collections import Counter
 from .losses import Loss
 
 WINDOW_S = 2.0
-MANY = 5  # packets in a window; a single one says little
+MANY = 5  # packets, or frames, in a window; a single one says little
 COMPLAINTS = {
     Loss.BAD_CHECKSUM: "packets fail their checksum: check cable and network switch",
     Loss.OTHER_SENSOR: "packets of another sensor come to the same UDP port: give each sensor a port of its own",
@@ -14,7 +14,7 @@ COMPLAINTS = {
     Loss.WRONG_SIZE: "packets of another profile or sender come to the same UDP port",
     Loss.WRONG_COLUMN: "packets of another lidar mode come to the same UDP port",
     Loss.SKIPPED_FRAME: "frames are skipped, as this machine is too slow for the sensor",
-    Loss.OVERFLOW: "packets are dropped, as this machine is too slow for the sensor",
+    Loss.OVERFLOW: "packets are dropped, as this machine is much too slow for the sensor",
 }
 
 

@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 TICK_S = 0.2  # how often None is yielded while there is no frame
 FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 30.0
 OPENING_TIMEOUT_S = 120.0  # of which it may spin up for a minute
+RECHECK_S = 10.0  # a sensor whose packets carry no ids
 SILENCE_S = 2.0  # twenty frames missing: ask the sensor why
 
 
@@ -32,7 +33,7 @@ class Phase(str, Enum):
     CONNECTING = "connecting"  # it is asked, set, and listened for
     WAITING = "waiting"  # the next attempt is due in a while
     RUNNING = "running"
-    SILENT = "silent"  # it is open, but nothing comes
+    SILENT = "silent"  # it is open, but no frame comes
 
     def __str__(self) -> str:
         return self.value
@@ -111,16 +112,20 @@ class KeptSource:
     def _read(self, live: LiveSource) -> Iterator[Frame | None]:
         """Frames, until the sensor must be opened again, which is raised, or until stopped."""
         faults, inquiry = FaultWatch(self.losses), self._inquiry(live)
+        recheck = _Inquiry(inquiry.ask, "", RECHECK_S, RECHECK_S)
         heard_s = time.monotonic()
         for frame in live.listen():
             if frame is not None:
                 if self.state.phase is not Phase.RUNNING:
                     inquiry = self._inquiry(live)
-                heard_s = time.monotonic()
+                if not live.has_ids:
+                    recheck.problem()  # of a restart, which its packets do not tell; whether it answers is no matter
                 self._tell(Phase.RUNNING, faults.problem())
             elif time.monotonic() - heard_s > self._silence_s:
-                self._tell(Phase.SILENT, inquiry.problem())
+                self._tell(Phase.SILENT, faults.problem() or inquiry.problem())
             yield frame
+            if frame is not None:
+                heard_s = time.monotonic()  # only now: a reader may take long for a frame
 
     def _inquiry(self, live: LiveSource) -> "_Inquiry":
         sensor, init_id = SensorHttp(self._address), live.sensor.init_id
@@ -158,7 +163,8 @@ class _Inquiry:
     """Asks a sensor that is silent, at growing intervals, what is the matter."""
 
     def __init__(self, ask: Callable[[], None], nothing_wrong: str, first_delay_s: float, longest_delay_s: float):
-        self._ask, self._delay_s, self._longest_delay_s = ask, first_delay_s, longest_delay_s
+        self.ask = ask
+        self._delay_s, self._longest_delay_s = first_delay_s, longest_delay_s
         self._problem = self._nothing_wrong = nothing_wrong
         self._asked: Future | None = None
         self._due_s = 0.0
@@ -166,7 +172,7 @@ class _Inquiry:
     def problem(self) -> str:
         """What it said last. Raises SensorChanged where it must be opened again."""
         if self._asked is None and time.monotonic() >= self._due_s:
-            self._asked = _in_background(self._ask)
+            self._asked = _in_background(self.ask)
         elif self._asked is not None and self._asked.done():
             error, self._asked = self._asked.exception(), None
             if error is not None and (isinstance(error, SensorChanged) or not isinstance(error, DriverError)):

@@ -16,12 +16,14 @@ from .errors import BadMetadata, SensorChanged, SensorUnavailable
 from .frame import Frame
 from .losses import Loss
 from .metadata import parse_metadata, sensor_from_info
-from .packets import FrameAssembler, PacketFilter
+from .packets import FrameAssembler, PacketFilter, packets_per_frame
 from .sensor_http import SensorHttp, resolve
 from .sensor_setup import AS_IT_IS, SensorWish, prepare_sensor
 from .source import Source
 
-BUFFER_S = 1.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
+BUFFER_S = 3.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
+BACKLOG_S = 1.0  # of packets that wait; beyond, whole frames are skipped: odometry does well with every second one
+MOST_SKIPPED = 4  # in a row: over longer gaps the odometry is lost
 POLL_S = 0.2  # how soon a stop is noticed
 ERROR_PAUSE_S = 0.01
 USELESS_PACKETS = 64  # so many in a row that are not the sensor's as it was opened: it is another one now
@@ -63,7 +65,7 @@ class LiveSource(Source):
         self._info = parse_metadata(text)
         self.sensor = sensor_from_info(self._info, text)
         self._filter = PacketFilter(self._info)
-        self.port = self._filter.port
+        self.port, self.has_ids = self._filter.port, self._filter.has_ids
         if not self.port:
             raise BadMetadata(f"the metadata of {address} names no udp_port_lidar to listen at")
         try:
@@ -75,6 +77,9 @@ class LiveSource(Source):
                 f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
             ) from None
         self._overflown = self._useless = 0
+        self._frame_id = -1  # of the last packet
+        self._skipping, self._n_skipped = False, 0  # that frame, and so many in a row
+        self._packets_per_s = packets_per_frame(self._info) * self._info.format.fps
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self.listen():
@@ -87,26 +92,39 @@ class LiveSource(Source):
         Raises SensorChanged where what comes is not of the sensor as it was opened.
         """
         assembler = FrameAssembler(self._info, self.losses)
-        heard = told = time.monotonic()
+        heard = told = time.monotonic()  # the time that the reader takes for a frame is not ours
         while not self._stop.is_set():
             packet = self._next_packet()
-            now = time.monotonic()
             if packet is not None:
-                heard = now
-                for lidar_frame in assembler.add(packet):
-                    told = now
+                heard = time.monotonic()
+                for lidar_frame in () if self._is_skipped(packet.frame_id()) else assembler.add(packet):
                     yield from self._frames(lidar_frame)
-            elif self._timeout_s and now - heard > self._timeout_s:
+                    told = time.monotonic()
+            elif self._timeout_s and time.monotonic() - heard > self._timeout_s:
                 raise SensorUnavailable(
                     f"sensor {self._address} has sent nothing to UDP port {self.port} for "
                     f"{self._timeout_s:g} s: check its udp_dest and the firewall"
                 )
-            if now - told >= POLL_S:
-                told = now
+            if time.monotonic() - told >= POLL_S:
                 yield None
+                told = time.monotonic()
+
+    @property
+    def backlog_s(self) -> float:
+        """Seconds of packets that have come and wait to be read."""
+        return self._packets.buffer_size() / self._packets_per_s
 
     def close(self) -> None:
         self._packets.close()
+
+    def _is_skipped(self, frame_id: int) -> bool:
+        """Whether the frame is left out to catch up: decided at its first packet, so that the others are whole."""
+        if frame_id != self._frame_id:
+            self._frame_id = frame_id
+            self._skipping = self.backlog_s > BACKLOG_S and self._n_skipped < MOST_SKIPPED
+            self._n_skipped = self._n_skipped + 1 if self._skipping else 0
+            self.losses[Loss.SKIPPED_FRAME] += self._skipping
+        return self._skipping
 
     def _next_packet(self) -> LidarPacket | None:
         """The next packet that is of use, None where none comes within about POLL_S."""

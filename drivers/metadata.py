@@ -55,8 +55,8 @@ def parse_metadata(json_text: str) -> core.SensorInfo:
     used = {key: value for key, value in document.items() if key not in UNUSED_PARTS}
     if not _is_digestible(used):
         raise BadMetadata("metadata is malformed: it holds a text, list or nesting that is far too long")
-    if huge := _huge_entry(used):
-        raise BadMetadata(f"metadata is malformed: {huge}")
+    if wild := _wild_entry(used):
+        raise BadMetadata(f"metadata is malformed: {wild}")
     try:
         info = core.SensorInfo(json.dumps(used, ensure_ascii=False))
         fault = _fault(info) or _replaced_entry(used, info)
@@ -113,12 +113,12 @@ def _is_digestible(value: object, depth: int = 0) -> bool:
     return not isinstance(value, str) or len(value) <= MAX_TEXT
 
 
-def _huge_entry(document: dict) -> str | None:
+def _wild_entry(document: dict) -> str | None:
     """An entry by which the SDK would count, or reserve memory, for minutes."""
     for section in FORMAT_SECTIONS:
         entries = document.get(section)
         for name, value in entries.items() if isinstance(entries, dict) else ():
-            if isinstance(value, (int, float)) and not abs(value) <= MAX_COLUMNS:
+            if isinstance(value, (int, float)) and not 0 <= value <= MAX_COLUMNS:
                 return f"{name} is {value}"
     return None
 

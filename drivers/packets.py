@@ -146,6 +146,14 @@ class FrameAssembler:
         return self._checksum_seen and not right
 
 
+def packets_per_frame(info: core.SensorInfo) -> int:
+    """Packets that a rotation is sent in: those that touch the column window."""
+    first, last = info.format.column_window
+    columns = info.format.columns_per_frame
+    in_window = np.arange(first, last + 1 if first <= last else last + 1 + columns) % columns
+    return len(np.unique(in_window // info.format.columns_per_packet))
+
+
 def frame_from_sdk(lidar_frame: core.LidarFrame, sensor: Sensor) -> Frame | None:
     """The SDK's frame of this sensor -> ours, sharing its arrays; None where no column is valid."""
     valid = (lidar_frame.status & 1).astype(bool)

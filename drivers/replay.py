@@ -5,15 +5,12 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-from ouster.sdk import core
-
 from .beside import match_metadata
 from .datagrams import Datagram, Reassembler
 from .frame import Frame
 from .losses import Loss
 from .metadata import sensor_from_info
-from .packets import FrameAssembler
+from .packets import FrameAssembler, packets_per_frame
 from .pcap import PcapFile
 from .source import Source
 
@@ -51,11 +48,3 @@ class PcapSource(Source):
         if self._sender and datagram.source[0] != self._sender:
             return Loss.OTHER_SENSOR
         return self._filter.fault(datagram.payload, datagram.port)
-
-
-def packets_per_frame(info: core.SensorInfo) -> int:
-    """Packets that a rotation is sent in: those that touch the column window."""
-    first, last = info.format.column_window
-    columns = info.format.columns_per_frame
-    in_window = np.arange(first, last + 1 if first <= last else last + 1 + columns) % columns
-    return len(np.unique(in_window // info.format.columns_per_packet))

@@ -6,7 +6,6 @@ Not by the SDK, whose calls hold the GIL until the sensor answers: a slow one wo
 import json
 import socket
 import time
-from http import HTTPStatus
 from http.client import HTTPException, HTTPResponse, responses
 from urllib.request import HTTPErrorProcessor, ProxyHandler, Request, build_opener
 
@@ -46,14 +45,14 @@ class SensorHttp:
         """
         path = f"{CONFIG}?reinit=true&persist={str(persist).lower()}"
         status, text = self._request(path, json.dumps(params).encode())
-        if status != HTTPStatus.OK:
+        if not _is_success(status):
             said = " ".join(text[:SHOWN_BYTES].decode("utf-8", "replace").split())
             raise SensorRefused(f"sensor {self.address} refuses {params}: {status} {said}")
 
     def get(self, path: str) -> dict:
         """A JSON object that the sensor tells of itself. Raises SensorUnavailable where there is none."""
         status, text = self._request(path)
-        if status != HTTPStatus.OK:
+        if not _is_success(status):
             raise SensorUnavailable(
                 f"http://{self.address}/{path} answers {status} {responses.get(status, '')}: "
                 "no Ouster sensor, or firmware before 3.1"
@@ -109,6 +108,10 @@ def host_of(address: str) -> str:
     """The address without the HTTP port."""
     host, colon, port = address.rpartition(":")
     return host if colon and port.isdigit() and ":" not in host else address
+
+
+def _is_success(status: int) -> bool:
+    return 200 <= status < 300
 
 
 def _read(response: HTTPResponse) -> bytes:

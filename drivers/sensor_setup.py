@@ -58,7 +58,7 @@ def prepare_sensor(sensor: SensorHttp, wish: SensorWish, our_address: str, stop:
         stop.wait(POLL_S)  # for a moment it still tells the state before
         metadata = sensor.metadata()
     deadline = time.monotonic() + READY_TIMEOUT_S
-    while (status := metadata["sensor_info"].get("status")) != "RUNNING":
+    while (status := metadata["sensor_info"].get("status", "RUNNING")) != "RUNNING":
         if status == "ERROR" or time.monotonic() > deadline or stop.wait(POLL_S):
             raise SensorUnavailable(f"sensor {sensor.address} does not run: its status is {_shown(status)}")
         metadata = sensor.metadata()
@@ -82,7 +82,7 @@ def require_unchanged(sensor: SensorHttp, wish: SensorWish, our_address: str, in
             f"sensor {sensor.address} now has {now}, not {_listed(changed)}: another client took its stream, "
             "or it was restarted"
         )
-    status = info.get("status")
+    status = info.get("status", "RUNNING")
     if status != "RUNNING" or info.get("initialization_id", init_id) != init_id:
         raise SensorChanged(f"sensor {sensor.address} was restarted or reconfigured: its status is {_shown(status)}")
 

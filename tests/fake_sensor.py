@@ -20,6 +20,7 @@ class FakeSensor:
         self.requests: list[tuple[str, str]] = []
         self.set: list[dict] = []
         self.accepts = True
+        self.answers_post = 200
         fake = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -33,7 +34,7 @@ class FakeSensor:
                 if fake.accepts:
                     fake.document["config_params"] |= fake.set[-1]
                 fake.document["sensor_info"]["status"] = "RUNNING"
-                fake.answer(self, {})
+                fake.answer(self, {}, fake.answers_post)
 
             def log_message(self, *_):
                 pass
@@ -45,8 +46,8 @@ class FakeSensor:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
 
-    def answer(self, handler: BaseHTTPRequestHandler, document: dict | None) -> None:
-        handler.send_response(404 if document is None else 200)
+    def answer(self, handler: BaseHTTPRequestHandler, document: dict | None, status: int = 200) -> None:
+        handler.send_response(404 if document is None else status)
         handler.end_headers()
         handler.wfile.write(json.dumps(document).encode())
 

@@ -197,6 +197,7 @@ def test_a_lidar_that_was_off_is_named(tmp_path):
         ({"lidar_data_format__pixel_shift_by_row": [0] * 5}, "pixel_shift_by_row"),
         ({"lidar_data_format__columns_per_frame": 10**9}, "columns"),
         ({"lidar_data_format__pixels_per_column": 2**31}, "pixels_per_column is 2147483648"),
+        ({"lidar_data_format__pixels_per_column": -1}, "pixels_per_column is -1"),
         ({"lidar_data_format__column_window": [0, 5000]}, "column_window"),
         ({"lidar_intrinsics__lidar_to_sensor_transform": [0] * 16}, "lidar_to_sensor_transform"),
         ({"sensor_info__prod_line": "x" * 100_000}, "too long"),

@@ -17,7 +17,7 @@ from fake_sensor import free_port
 from follower import Follower
 
 from revisitd.daemon.cli import cli
-from revisitd.drivers import faults, sensor_setup
+from revisitd.drivers import faults, kept, sensor_setup
 from revisitd.drivers.kept import Phase
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.sensor_setup import SensorWish
@@ -158,6 +158,16 @@ def test_another_profile_and_mode_set_by_someone_else_are_followed(sensor, follo
     assert any((frame.range_mm == np.repeat(ranges_mm(index), 2, axis=1)).all() for index in range(N_FRAMES))
 
 
+def test_another_mode_is_followed_where_packets_carry_no_ids(sensor, follow, monkeypatch):
+    monkeypatch.setattr(kept, "RECHECK_S", 0.1)
+    sensor.configure(udp_profile_lidar="LEGACY", lidar_mode="1024x10")
+    follower = follow(sensor.address)
+    follower.more_frames(2)
+    sensor.configure(lidar_mode="512x10")  # the packets are as before, only fewer
+    follower.until_opened(2)
+    assert follower.more_frames(2)[-1].valid_ratio == 1
+
+
 def test_what_is_wished_is_set_again_when_someone_else_changes_it(sensor, follow):
     follower = follow(sensor.address, udp_profile_lidar="RNG15_RFL8_NIR8", azimuth_window=(90_000, 270_000))
     frame = follower.more_frames(2)[-1]
@@ -191,6 +201,15 @@ def test_checksum_failures_are_counted_and_named_and_go_away(sensor, follow):
     assert state.phase is Phase.RUNNING and follower.source.losses[Loss.BAD_CHECKSUM] > 5
     sensor.inject(corrupt=0.0)
     follower.until(lambda state: state.problem == "")
+
+
+def test_a_stream_of_nothing_but_damaged_packets_is_named_as_such(sensor, follow):
+    follower = follow(sensor.address)
+    follower.more_frames(2)
+    sensor.inject(corrupt=1.0)
+    follower.until(lambda state: state.phase is Phase.SILENT and "fail their checksum" in state.problem)
+    sensor.inject(corrupt=0.0)
+    follower.until(lambda state: state.phase is Phase.RUNNING and not state.problem)
 
 
 def test_packets_of_another_sensor_are_left_out_and_named(capture, sensor, follow):

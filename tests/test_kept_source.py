@@ -1,6 +1,7 @@
 """A sensor is kept open through all that it and the network do, and what is wrong is stated."""
 
 import socket
+import time
 
 import pytest
 from captures import metadata, packets, ranges_mm
@@ -77,6 +78,18 @@ def test_a_silent_sensor_is_listened_to_and_goes_on_without_being_opened_again(f
         fake.send(packets(fake.document, range(1)))
         state = follower.until_running()
         assert state.problem == "" and state.n_opened == 1
+
+
+def test_a_reader_that_is_slow_is_not_taken_for_a_silent_sensor(follow, caplog):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        fake.send(packets(fake.document, range(4)))
+        for _ in range(3):
+            follower.more_frames(1)
+            time.sleep(0.3)  # silence is 0.25 s
+        follower.more_frames(1)
+    assert not caplog.records
 
 
 def test_a_port_that_is_taken_is_named_and_tried_again(follow):

@@ -3,6 +3,7 @@
 import json
 import socket
 import threading
+import time
 from itertools import islice
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from captures import COLUMNS, INIT_ID, packets, ranges_mm
 from fake_sensor import METADATA, fake_sensor
 
+from revisitd.drivers import live
 from revisitd.drivers.errors import BadMetadata, SensorUnavailable
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.ouster import open_source
@@ -45,6 +47,19 @@ def test_a_sensor_that_does_not_take_the_settings_is_an_error():
         fake.accepts = False
         with pytest.raises(SensorUnavailable, match="does not take"):
             open_source(fake.address)
+
+
+def test_a_sensor_that_refuses_the_settings_is_quoted():
+    with fake_sensor(config_params__udp_dest="10.5.5.77") as fake:
+        fake.answers_post = 403
+        with pytest.raises(SensorUnavailable, match="refuses {'udp_dest': '127.0.0.1'}: 403 {}"):
+            open_source(fake.address)
+
+
+def test_a_sensor_that_takes_the_settings_without_a_word_is_believed():
+    with fake_sensor(config_params__udp_dest="10.5.5.77") as fake:
+        fake.answers_post = 202
+        open_source(fake.address).close()
 
 
 def test_a_sensor_in_error_is_an_error():
@@ -95,6 +110,18 @@ def test_a_restarted_sensor_ends_the_iteration():
         with pytest.raises(SensorUnavailable, match="restarted"):
             frames.extend(source)
         assert source.losses[Loss.OTHER_INIT_ID] == 64
+
+
+def test_a_reader_that_is_too_slow_gets_whole_frames_and_the_rest_is_counted(monkeypatch):
+    monkeypatch.setattr(live, "BACKLOG_S", 0.25)
+    with fake_sensor() as fake, open_source(fake.address, timeout_s=5) as source:
+        for index in range(8):
+            fake.send(packets(fake.document, range(index, index + 1)))
+            while source.backlog_s < 0.1 * (index + 1) - 1e-6:
+                time.sleep(0.001)
+        frames = list(islice(source, 3))
+    assert [(frame.frame_id, frame.valid_ratio) for frame in frames] == [(4, 1), (6, 1), (7, 1)]
+    assert source.losses[Loss.SKIPPED_FRAME] == 5
 
 
 def test_lost_packets_are_seen_in_the_frame():
