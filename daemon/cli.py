@@ -9,7 +9,7 @@ import click
 from .. import __version__
 from ..drivers.errors import BadCapture, BadMetadata, DriverError, SensorUnavailable, SourceNotFound
 from ..storage.errors import NewerFormat, StorageError
-from .commands import emulator, results, service, settings, sources
+from .commands import emulator, results, service, settings, sources, storage
 from .config import ConfigError
 from .install import InstallError
 from .notify import log_handler
@@ -57,9 +57,9 @@ def _exit_codes():
 def cli(verbose: int) -> None:
     """Tells what has changed in a place since the robot's earlier visits, from an Ouster OS1's packets.
 
-    Exit codes: 0 done, 2 wrong use, 65 bad data (capture or metadata), 66 no such source, 69 sensor not
-    reached or systemd not there, 74 input/output (disk, data directory), 78 settings, model, or a data directory of a
-    newer revisitd.
+    Exit codes: 0 done, 1 fsck has found problems, 2 wrong use, 65 bad data (capture or metadata), 66 no such source,
+    69 sensor not reached or systemd not there, 74 input/output (disk, data directory), 78 settings, model, or a data
+    directory of a newer revisitd.
     """
     level = {0: logging.ERROR, 1: logging.INFO}.get(verbose, logging.DEBUG)
     logging.basicConfig(level=level, handlers=[log_handler()])
@@ -78,6 +78,7 @@ for command in (
     emulator.emulate,
     settings.dump_config_,
     settings.check_config,
+    storage.fsck,
     service.doctor,
     service.install_service,
     service.uninstall_service,

@@ -64,11 +64,12 @@ def _aligned(rows: list[tuple[str, ...]], left: set[int]) -> str:
 
 def changes_json(changes: Sequence[ChangeObject], with_points: bool) -> str:
     """A JSON list, one change on each line; with_points: the changes must have been read with theirs."""
-    lines = [json.dumps(_json_change(change, with_points)) for change in changes]
+    lines = [json.dumps(change_fields(change, with_points)) for change in changes]
     return "[" + ",".join(f"\n  {line}" for line in lines) + "\n]" if lines else "[]"
 
 
-def _json_change(change: ChangeObject, with_points: bool) -> dict:
+def change_fields(change: ChangeObject, with_points: bool) -> dict:
+    """What programs are told of a change; with_points: it must have been read with its points."""
     fields = {
         "id": change.id,
         "polarity": change.polarity,

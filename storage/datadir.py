@@ -106,6 +106,10 @@ class DataDir:
             with naming(path):
                 write_atomically(path, metadata.encode(), path.parent)
 
+    def has_sensor(self, digest: str) -> bool:
+        """Whether a sensor's metadata is kept."""
+        return self._sensor_path(digest).exists()
+
     def get_sensor(self, digest: str) -> str:
         """A sensor's metadata JSON. Raises DataDirError."""
         path = self._sensor_path(digest)

@@ -37,7 +37,7 @@ def open_index(data_dir: DataDir, scans: ScanStore, repairs: list[str]) -> Index
     except DatabaseCorrupt as error:
         logger.error("%s", error)
         fault = f"{path} was damaged"
-    kept = _move_aside(path)
+    kept = move_aside(path)
     _note(repairs, f"{fault}; {kept}{rebuild_index(data_dir, scans)}")
     return IndexStore.open_writer(path, data_dir.uuid)
 
@@ -55,7 +55,7 @@ def open_changes(data_dir: DataDir, repairs: list[str]) -> ChangeStore:
     except DatabaseCorrupt as error:
         logger.error("%s", error)
         fault = f"{path} was damaged"
-    kept = _move_aside(path)
+    kept = move_aside(path)
     restored = _restore(data_dir)
     store = ChangeStore.open_writer(path, data_dir.uuid)
     store.skip_used_numbers()
@@ -69,8 +69,8 @@ def _note(repairs: list[str], what: str) -> None:
     repairs.append(what)
 
 
-def _move_aside(path: Path) -> str:
-    """Keep a damaged database, with its WAL, under another name; the words for that. Empty where there is none."""
+def move_aside(path: Path) -> str:
+    """Keep a damaged database, with its WAL, under another name; the words for that, empty where there is none."""
     if not path.exists():
         return ""
     kept = path.with_name(f"{path.name}.corrupt-{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}")

@@ -16,12 +16,22 @@ from .options import CONFIG, DATA
               help="For people, or for programs.")  # fmt: skip
 @click.option("--points", is_flag=True, help="Each change's points too (JSON).")
 @click.option("--min-points", default=0, show_default=True, help="Only changes of at least so many points.")
-def changes(data: Path, form: str, points: bool, min_points: int) -> None:
+@click.option("--follow", "follows", is_flag=True, help="Go on: a line of JSON for each new or altered change.")
+@click.option("--since", type=int, help="Lines of JSON for what is new or altered after this revision.")
+def changes(data: Path, form: str, points: bool, min_points: int, follows: bool, since: int | None) -> None:
     """List the changes found. Metres, in the map frame: the sensor's pose at the end of the first accepted frame
-    of the first session (x forward, y left, z up)."""
+    of the first session (x forward, y left, z up).
+
+    With --follow or --since: one JSON object a line, in the order of "revision". Each was "changed" (new, or altered,
+    as it is now) or "merged" (it is a part of another, and no change any more). Who stops goes on with --since and
+    the last revision read, and misses nothing.
+    """
     from ...storage.store import Store
     from .. import report
 
+    if follows or since is not None:
+        _lines(data, points, follows, since or 0)
+        return
     with Store.open_reader(data) as store:
         found = store.changes.changes(min_points=min_points, with_points=points)
     if form == "table":
@@ -30,6 +40,17 @@ def changes(data: Path, form: str, points: bool, min_points: int) -> None:
         click.echo(report.changes_csv(found), nl=False)
     else:
         click.echo(report.changes_json(found, with_points=points))
+
+
+def _lines(data: Path, points: bool, forever: bool, since: int) -> None:
+    from ...storage.datadir import DataDir
+    from ..follow import follow
+
+    try:
+        # click.echo flushes: a program at the other end of a pipe sees each line at once.
+        follow(DataDir.open_reader(data).changes_path, since, points, click.echo, forever)
+    except KeyboardInterrupt:
+        pass
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # -3.5 is a coordinate
