@@ -6,6 +6,7 @@ else: a frame that never ends, or a detection long past its deadline, is not ali
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import signal
 import threading
@@ -34,6 +35,7 @@ class Service:
 
     def run(self) -> None:
         """Until SIGTERM or SIGINT. Raises the storage's errors and ModelError at the start."""
+        faulthandler.enable()  # the watchdog's SIGABRT: the journal shows what each thread was at
         self._listen_to_signals()
         notify("STATUS=opening the store")
         address = self._config.sensor.address
