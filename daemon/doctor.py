@@ -14,6 +14,7 @@ from pathlib import Path
 from ..drivers.errors import DriverError
 from ..drivers.metadata import parse_metadata, sensor_from_info
 from ..drivers.sensor_http import SensorHttp, host_of, resolve
+from ..drivers.telemetry import read_telemetry
 from ..storage.errors import StorageError
 from .config import Config
 from .status import NotRunning, read_status
@@ -108,7 +109,8 @@ def _service(data: Path) -> Finding:
 
 
 def _sensor(address: str) -> Iterator[Finding]:
-    metadata = SensorHttp(address).metadata()
+    sensor = SensorHttp(address)
+    metadata = sensor.metadata()
     info, config = metadata["sensor_info"], metadata["config_params"]
     yield Finding("sensor", "ok", f"{info.get('prod_line')} {info.get('prod_sn')}, {info.get('image_rev')}")
     status = info.get("status")
@@ -119,7 +121,7 @@ def _sensor(address: str) -> Iterator[Finding]:
         "" if status == "RUNNING" else "`revisitd run` switches it on; ERROR: look at its alerts page",
     )
     yield _destination(address, config)
-    yield _clock(config)
+    yield from _health(sensor, config)
     yield from _packets(address, metadata)
 
 
@@ -133,12 +135,17 @@ def _destination(address: str, config: dict) -> Finding:
     )  # fmt: skip
 
 
-def _clock(config: dict) -> Finding:
-    mode = config.get("timestamp_mode", "")
-    if mode == "TIME_FROM_INTERNAL_OSC":
-        text = "counts from its power-up: times of day come from this machine's clock"
-        return Finding("sensor clock", "ok", f"{mode}: {text}")
-    return Finding("sensor clock", "ok", mode)
+def _health(sensor: SensorHttp, config: dict) -> Iterator[Finding]:
+    """What the sensor says of its clock and its alerts."""
+    telemetry, mode = read_telemetry(sensor), config.get("timestamp_mode", "")
+    if telemetry.clock_synced is False:
+        yield Finding("sensor clock", "warn", f"{mode}: not synchronised", "start its PTP master or its sync pulse")
+    elif mode == "TIME_FROM_INTERNAL_OSC":
+        yield Finding("sensor clock", "ok", f"{mode}: counts from its power-up; times of day are this machine's")
+    else:
+        yield Finding("sensor clock", "ok", mode)
+    for alert in telemetry.alerts:
+        yield Finding("sensor alert", "warn", alert, "see the sensor's web page")
 
 
 def _packets(address: str, metadata: dict) -> Iterator[Finding]:
