@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-from .errors import DriverError, SensorChanged, SensorUnavailable
+from .errors import DriverError, SensorChanged, SensorTaken, SensorUnavailable
 from .faults import FaultWatch
 from .frame import Frame, Sensor
 from .live import LiveSource
@@ -81,14 +81,16 @@ class KeptSource:
     def __iter__(self) -> Iterator[Frame | None]:
         delay_s = self._first_delay_s
         while not self._stop.is_set():
-            opened_s = time.monotonic()
+            opened_s, well = time.monotonic(), False
             try:
                 with (yield from self._open()) as live:
                     yield from self._read(live)
             except DriverError as error:
+                # Two clients that take the stream from each other at once would keep it from both.
+                patient = isinstance(error, SensorTaken) and time.monotonic() - opened_s < self._longest_delay_s
+                well = self.state.phase in (Phase.RUNNING, Phase.SILENT) and not patient
                 self._tell(Phase.WAITING, str(error))
-            if time.monotonic() - opened_s > self._longest_delay_s:  # it ran well in between
-                delay_s = self._first_delay_s
+            delay_s = self._first_delay_s if well else delay_s
             yield from self._wait(delay_s)
             delay_s = min(2 * delay_s, self._longest_delay_s)
 
