@@ -99,8 +99,17 @@ class Session:
             index.add_visit_scans(visit_id, visit.scan_ids)
             index.close_visit(visit_id, visit.t_out_ns)
             if visit.number >= 2:
-                where = (self.session_id, self.map_id, visit.scene_id, visit_id, visit.number)
-                due.append(Instance(*where, visit.t_in_ns, visit.t_out_ns))
+                due.append(
+                    Instance(
+                        self.session_id,
+                        self.map_id,
+                        visit.scene_id,
+                        visit_id,
+                        visit.number,
+                        visit.t_in_ns,
+                        visit.t_out_ns,
+                    )
+                )
         return due
 
     def _load_reference(self, scene: Scene) -> Iterator[Moments]:
