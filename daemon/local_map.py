@@ -11,7 +11,7 @@ from .sweep_fit import SweepFit, fit_sweep
 from .voxels import Moments
 
 CLEAR_EVERY = 5  # scans between two sweeps of what was not seen for long
-MAX_VOXELS = 300_000  # 50 MB; a street fills a hundred thousand
+MAX_VOXELS = 300_000  # 28 MB; a street fills a hundred thousand
 GATE_M = 0.5  # pairs farther apart do not pull
 MAX_MOVE_M = 0.3  # between two key scans KISS-ICP is right to some centimetres; more is a wrong match
 MAX_TURN_DEG = 2.5

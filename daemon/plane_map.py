@@ -13,14 +13,15 @@ MAX_THICKNESS_M = 0.15  # standard deviation across it; thicker is foliage, or a
 FLATNESS = 2.0  # how many times wider than thick a plane is at least
 NOISE_M = 0.02  # of a range and of a pose: a plane is not known better
 
+# Means are of the map, which may be kilometres across; the rest is of a voxel.
 VOXEL = np.dtype(
     [
-        ("last_scan", np.int64),
-        ("count", np.float64),
+        ("last_scan", np.int32),
+        ("count", np.float32),
         ("mean", np.float64, 3),
-        ("covariance", np.float64, (3, 3)),
-        ("normal", np.float64, 3),
-        ("weight", np.float64),
+        ("covariance", np.float32, (3, 3)),
+        ("normal", np.float32, 3),
+        ("weight", np.float32),
     ]
 )
 
@@ -37,6 +38,11 @@ class PlaneMap:
     def __len__(self) -> int:
         """Voxels in the map."""
         return len(self._keys)
+
+    @property
+    def means(self) -> np.ndarray:
+        """(N, 3) float64 metres, map frame: the mean of the points of each voxel."""
+        return self._voxels["mean"]
 
     def planes_at(self, points: np.ndarray) -> Planes:
         """The plane of the voxel that each of the points (N, 3), map frame, lies in."""
