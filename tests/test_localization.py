@@ -115,3 +115,13 @@ def test_a_scan_of_clutter_is_refused_and_the_prediction_stands():
     fix = localizer().locate(seen_from(pose, rng.uniform(-40, 40, (100_000, 3))), motion(pose), [SCENE])
     assert not fix.aligned
     np.testing.assert_array_equal(fix.T_map_sensor, pose)
+
+
+def test_a_scene_of_which_nothing_is_stored_is_as_a_new_place_until_something_is():
+    """The disk was full when its scans were taken; small_gicp would end the process."""
+    stored, pose = [], yard.pose(1.0, -2.0, 0.4)
+    known = Localizer(Config().alignment, lambda scene: iter(stored), np.eye(4))
+    fix = known.locate(seen_from(pose, surface(1)), motion(pose), [SCENE])
+    assert not fix.aligned and "nothing is stored" in fix.reason
+    stored.extend(first_visit(SCENE))
+    assert known.locate(seen_from(pose, surface(1)), motion(pose), [SCENE]).aligned
