@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..storage.changes import Change, ChangeObject, ChangeStore
+from ..storage.changes import Change, ChangeObject, ChangeStore, Observation
 from .confidence import confidence
 from .detection.results import ERASE_M, DetectedObject, Erasure, KnownChange, KnownState
+from .worker import Instance
 
 TOUCH_M = 0.4  # objects nearer than the cluster distance are one
 MIN_SEEN_SHARE = 0.25  # of a known change's points; a visit that saw less of it says nothing
@@ -100,24 +101,24 @@ class ChangeManager:
         held = self._store.changes(map_id=map_id, box=box, before=before)
         return [KnownChange(c.id, c.polarity, c.points) for c in held if c.state == "present"]
 
-    def note(self, states: list[KnownState], finding_of: dict[str, int], time_ns: int) -> None:
-        """Write down what a visit (finding_of: session, scene, visit) saw of the changes known before it.
+    def note(self, states: list[KnownState], instance: Instance) -> None:
+        """Write down what the visit of an instance saw of the changes known before it.
 
         What the detection of the same visit found to have ended, or found again, has its entry already. One whose
         place is seen to be as before, though too little of it for a change of its own, has ended too.
         """
+        visit = instance.session_id, instance.scene_id, instance.visit
         for state in states:
             if self._store.whole_of(state.change_id) != state.change_id:
                 continue  # this visit has found it to be a part of another
             change = self._store.get(state.change_id, with_points=False)
             last = self._store.history(state.change_id)[-1]
-            same_visit = all(last[f"{key}_id" if key != "visit" else key] == value for key, value in finding_of.items())
-            if change.state != "present" or same_visit:
+            if change.state != "present" or (last["session_id"], last["scene_id"], last["visit"]) == visit:
                 continue
-            kind, shares = _seen_as(state), (state.share_still, state.share_undone)
+            seen = Observation(_seen_as(state), *visit, instance.t_out_ns, state.share_still, state.share_undone)
             # That a neighbouring scene does not see a thing is no news; that its own does not, is.
-            if kind != "unseen" or change.scene == finding_of["scene"]:
-                self._store.observe(state.change_id, kind, **finding_of, time_ns=time_ns, shares=shares)
+            if seen.kind != "unseen" or change.scene == instance.scene_id:
+                self._store.observe(state.change_id, seen)
 
     def _touching(self, points: np.ndarray, map_id: int) -> list[tuple[ChangeObject, float]]:
         """Changes that no other change undid and that touch the points; and the share of the smaller that touches."""
@@ -126,9 +127,11 @@ class ChangeManager:
         shares = [(c, _touch_share(c.points, points)) for c in near if c.superseded_by is None]
         return [(c, share) for c, share in shares if share > 0.0]
 
-    def _observe(self, change: ChangeObject, kind: str, found: DetectedObject, finding: Finding, **more: int) -> None:
-        where = {"session": finding.session, "scene": finding.scene, "visit": finding.visit}
-        self._store.observe(change.id, kind, **where, time_ns=found.after_ns, **more)
+    def _observe(
+        self, change: ChangeObject, kind: str, found: DetectedObject, finding: Finding, superseded_by: int | None = None
+    ) -> None:
+        seen = Observation(kind, finding.session, finding.scene, finding.visit, found.after_ns)
+        self._store.observe(change.id, seen, superseded_by)
 
 
 def _seen_as(state: KnownState) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .detection.results import DetectedObject
 
-WEIGHTS = (1.11, 1.67, 0.04, -1.85, -5.9)
+WEIGHTS = (0.59, 2.61, -0.15, -2.24, -5.35)
 CERTAIN = 0.99  # what a model fitted on virtual worlds may say of the real one, at most
 
 

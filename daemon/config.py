@@ -135,20 +135,28 @@ class SubmapConfig(_Section):
 
 
 class AlignmentConfig(_Section):
-    """Registration of key scans to the scene's first visit, and to the key scans before (GICP, small_gicp)."""
+    """Registration of key scans to the scene's first visit, and to the key scans before: point to plane."""
 
-    voxel_m: float = Field(0.25, gt=0, description="voxel of both clouds")
+    cell_m: float = Field(0.5, gt=0, description="a scan's returns are summed up in cells of this size")
+    voxel_m: float = Field(
+        0.25, gt=0, description="voxel of both clouds where a key scan is looked for in earlier maps (GICP)"
+    )
     range_m: float = Field(60.0, gt=0, description="returns farther away are not registered")
     gate_m: float = Field(0.6, gt=0, description="pairs farther apart are not matched: changes do not pull")
     coarse_gate_m: float = Field(3.0, gt=0, description="... in a second attempt, after a large drift")
     drift_ratio: float = Field(
         0.01, ge=0, description="drift expected per metre since the last fix: how far out a scene is looked for"
     )
-    local_voxel_m: float = Field(
-        0.5, gt=0, description="in a new place: voxel of the last key scans' map (halves KISS-ICP's error by study)"
+    plane_voxel_m: float = Field(
+        0.5, gt=0, description="voxel of the maps of planes; 0.8 takes two thirds of the time, and drifts a third more"
     )
     local_scans: int = Field(120, ge=2, description="key scans that this map remembers: 60 m of path")
-    min_inlier_ratio: float = Field(0.6, gt=0, le=1, description="share of the scan that must find a partner")
+    min_inlier_ratio: float = Field(
+        0.6,
+        gt=0,
+        le=1,
+        description="share of the scan that must lie where the first visit met something (mostly 0.9)",
+    )
     max_residual_m: float = Field(
         0.12, gt=0, description="root mean square distance to the reference's surface, at most"
     )

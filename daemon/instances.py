@@ -175,8 +175,7 @@ class ChangeDetection:
             found = replace(found, before_ns=before.stamp_ns[found.before_ns], after_ns=after.stamp_ns[found.after_ns])
             n_new += self._manager.record(found, finding)
             _log(found, instance)
-        where = {"session": instance.session_id, "scene": instance.scene_id, "visit": instance.visit}
-        self._manager.note(comparison.known, where, instance.t_out_ns)
+        self._manager.note(comparison.known, instance)
         return n_new
 
 

@@ -20,7 +20,6 @@ from ..storage.rows import InstanceRow
 from ..storage.scans import Scan
 from ..storage.store import Store
 from .config import Config
-from .geometry import column_phase, deskew
 from .joining import Join, Joiner, Locate
 from .localization import Fix
 from .memory import return_freed
@@ -29,10 +28,12 @@ from .relocalization import Answer, Question
 from .scenes import SceneUpdate
 from .sensors import Sensors
 from .session import Session
-from .views import OWN_BODY_M
+from .sweep import sweep_of
 from .worker import DetectionWorker
 
 logger = logging.getLogger(__name__)
+
+PREPARE_M = 6.0  # a scene's first visit is read over its ten scans' worth of key scans, so far before it is entered
 
 
 @dataclass
@@ -129,12 +130,10 @@ class Pipeline:
 
     def _keep(self, session: Session, frame: Frame, motion: Motion) -> None:
         """A key scan: find where it is, describe it, store it, and tell the scenes."""
-        points = deskew(
-            frame.sensor.points(frame.range_mm), column_phase(frame.column_ns, frame.column_valid), motion.T_start_end
-        )
-        returns = points[(frame.range_mm > OWN_BODY_M * 1e3) & frame.column_valid]
-        scenes = session.scenes_to_align_with(motion.T_odom_sensor)
-        fix = session.localizer.locate(returns, motion.T_odom_sensor, scenes)
+        alignment = self._config.alignment
+        sweep = sweep_of(frame, frame.sensor, alignment.range_m, alignment.cell_m)
+        fix = session.localizer.locate(sweep, motion, session.scenes_to_align_with(motion.T_odom_sensor))
+        session.localizer.prepare(session.scenes_to_align_with(motion.T_odom_sensor, PREPARE_M))
         scan = self._scan(session, frame, motion, fix)
         self._store.add_scan(scan)
         self.counts.key_scans += 1
@@ -170,7 +169,7 @@ class Pipeline:
             column_valid=frame.column_valid,
             T_map_sensor=fix.T_map_sensor,
             T_odom_sensor=motion.T_odom_sensor,
-            T_start_end=motion.T_start_end,
+            T_start_end=fix.T_start_end,
             descriptor=self._model.describe(frame.range_mm, sensor.pixel_shift, sensor.altitude_rad),
             model_id=self._model.model_id,
             aligned=fix.aligned,

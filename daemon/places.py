@@ -6,15 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..drivers.frame import Sensor
 from ..storage.rows import SceneScans
+from ..storage.scans import Scan
 from ..storage.store import Store
 from .config import DetectionConfig
 from .detection.occlusion import sight
+from .detection.submap import Submap
 from .sensors import Sensors
-from .submap_build import scan_view
+from .submap_build import build_submap
 
 STEPS = np.array([-0.5, 0.0, 0.5])  # of the radius: a place is asked at 27 points
 MIN_SEEN_SHARE = 0.25  # of them; a visit that saw fewer says nothing
+CORE_SHARE = 2 / 3  # of the radius: what has returns from so near its middle is there, ...
+CORE_RETURNS = 2  # ... so many in each of the scans that a thing must be seen by: a single one may be noise
 
 
 @dataclass(frozen=True)
@@ -41,11 +46,43 @@ def place_history(
     Sight is that of the occlusion filter: limits gives its range and margin.
     """
     sensors = Sensors(store.dir)
-    samples = (place + radius_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)).astype(np.float32)
     history: list[PlaceSeen] = []
-    for scans in _visits_near(store, map_id, place, limits.occlusion_range_m):
-        history.append(_seen(store, sensors, scans, samples, limits, history))
+    for scene, scans in _visits_near(store, map_id, place, limits.occlusion_range_m):
+        views = _views(store, sensors, scans, limits.occlusion_range_m)
+        occupied, free, state = look(views, place, radius_m, limits)
+        history.append(
+            PlaceSeen(
+                scene,
+                int(scans.visit_number[0]),
+                int(scans.session[0]),
+                int(scans.stamp_ns[0]),
+                int(scans.stamp_ns[-1]),
+                len(views.images),
+                occupied,
+                free,
+                state,
+                _verdict(state, history),
+            )
+        )
     return history
+
+
+def look(views: Submap, place: np.ndarray, radius_m: float, limits: DetectionConfig) -> tuple[float, float, str]:
+    """Shares of a place (3,) that the scans of a visit saw occupied and free, and the state that follows.
+
+    A thin panel that is seen from its side fills little of the place, and beams pass it on either side: it is there
+    all the same if there are returns from its very middle.
+    """
+    samples = (place + radius_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)).astype(np.float32)
+    seen = sight(samples, views.images, limits.occlusion_margin_m, limits.occlusion_range_m)
+    occupied, free = float((seen.at > seen.through).mean()), float((seen.through > seen.at).mean())
+    in_core = ((views.points - place.astype(np.float32)) ** 2).sum(axis=1) < (CORE_SHARE * radius_m) ** 2
+    meeting = np.bincount(views.scan[in_core], minlength=len(views.images)) >= CORE_RETURNS
+    if meeting.sum() >= limits.min_showing_scans:
+        return occupied, free, "occupied"
+    if occupied + free < MIN_SEEN_SHARE:
+        return occupied, free, "not observed"
+    return occupied, free, "occupied" if occupied >= free else "free"
 
 
 def _visits_near(store: Store, map_id: int, place: np.ndarray, range_m: float) -> list[tuple[int, SceneScans]]:
@@ -61,30 +98,18 @@ def _visits_near(store: Store, map_id: int, place: np.ndarray, range_m: float) -
     return visits
 
 
-def _seen(
-    store: Store,
-    sensors: Sensors,
-    scene_and_scans: tuple[int, SceneScans],
-    samples: np.ndarray,
-    limits: DetectionConfig,
-    before: list[PlaceSeen],
-) -> PlaceSeen:
-    scene, scans = scene_and_scans
-    images = []
-    for scan in store.scans.read_all(zip(scans.session.tolist(), scans.scan_id.tolist(), strict=True)):
-        images.append(scan_view(scan, sensors.get(scan.sensor_digest), limits.occlusion_range_m)[2])
-    seen = sight(samples, images, limits.occlusion_margin_m, limits.occlusion_range_m)
-    occupied, free = float((seen.at > seen.through).mean()), float((seen.through > seen.at).mean())
-    state = "not observed"
-    if occupied + free >= MIN_SEEN_SHARE:
-        state = "occupied" if occupied >= free else "free"
+def _views(store: Store, sensors: Sensors, scans: SceneScans, range_m: float) -> Submap:
+    def read(i: int) -> tuple[Scan, Sensor]:
+        scan = store.scans.read(int(scans.session[i]), int(scans.scan_id[i]))
+        return scan, sensors.get(scan.sensor_digest)
+
+    return build_submap(read, scans.visit_number, range_m)[0]
+
+
+def _verdict(state: str, before: list[PlaceSeen]) -> str:
     known = [other.state for other in before if other.state != "not observed"]
-    verdict = state if state == "not observed" else "first" if not known else _verdict(state, known[-1])
-    return PlaceSeen(
-        scene, int(scans.visit_number[0]), int(scans.session[0]), int(scans.stamp_ns[0]), int(scans.stamp_ns[-1]),
-        len(images), occupied, free, state, verdict,
-    )  # fmt: skip
-
-
-def _verdict(state: str, last: str) -> str:
-    return "same" if state == last else "changed"
+    if state == "not observed":
+        return state
+    if not known:
+        return "first"
+    return "same" if state == known[-1] else "changed"

@@ -12,6 +12,9 @@ from .geometry import transform
 SCAN_VOXEL_RATIO = 1.2  # a scan is thinner than the reference it is registered to
 NEIGHBOURS = 10  # for the normals of a scan
 SURFACE_NEIGHBOURS = 12
+# An OS1-128 in a street leaves half as many. Leaves, rain or noise all around would leave ten times as many, and a
+# registration would take half a minute.
+MAX_SCAN_POINTS, MAX_SURFACE_POINTS = 40_000, 200_000
 STEEP = 0.7  # cosine of a normal with the vertical below which a surface stands upright
 HIT_M = 0.3  # an upright point this near to the surface is met
 
@@ -37,13 +40,24 @@ class Match:
 
 def surface_of(points: np.ndarray, voxel_m: float) -> Surface:
     """Points (N, 3) float32 metres, map frame, thinned to voxels."""
-    return Surface(*small_gicp.preprocess_points(points.astype(np.float64), voxel_m, SURFACE_NEIGHBOURS, 1))
+    return Surface(*_thinned(points.astype(np.float64), voxel_m, SURFACE_NEIGHBOURS, MAX_SURFACE_POINTS))
 
 
 def scan_cloud(points: np.ndarray, voxel_m: float, range_m: float) -> small_gicp.PointCloud:
     """Returns (N, 3) float32 metres, sensor frame, within range and thinned for a surface of such voxels."""
     near = points[(points**2).sum(axis=1) < range_m**2].astype(np.float64)
-    return small_gicp.preprocess_points(near, voxel_m * SCAN_VOXEL_RATIO, NEIGHBOURS, 1)[0]
+    return _thinned(near, voxel_m * SCAN_VOXEL_RATIO, NEIGHBOURS, MAX_SCAN_POINTS)[0]
+
+
+def _thinned(
+    points: np.ndarray, voxel_m: float, neighbours: int, at_most: int
+) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
+    """One point a voxel, and of these at most so many, with normals and covariances; and a tree over them."""
+    thin = small_gicp.voxelgrid_sampling(points, voxel_m, 1).points()[:, :3]
+    cloud = small_gicp.PointCloud(thin[:: max(1, -(-len(thin) // at_most))])
+    tree = small_gicp.KdTree(cloud, 1)
+    small_gicp.estimate_normals_covariances(cloud, tree, neighbours, 1)
+    return cloud, tree
 
 
 def align(scan: small_gicp.PointCloud, surface: Surface, T_map_sensor: np.ndarray, gate_m: float) -> np.ndarray:

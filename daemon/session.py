@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from .. import __version__
@@ -13,9 +15,10 @@ from .joining import Join
 from .keyscans import KeyScanRule
 from .localization import Localizer
 from .odometry import Odometry
-from .references import reference_points
+from .references import reference_cells
 from .scenes import Scene, SceneTracker, SceneUpdate
 from .sensors import Sensors
+from .voxels import Moments
 from .worker import Instance
 
 
@@ -65,11 +68,11 @@ class Session:
         """The session that goes on from this one, which has ended, in an earlier map: the same odometry, no break."""
         return Session(self._config, self._store, self._sensors, self._sensor, self._source, join, self)
 
-    def scenes_to_align_with(self, T_odom_sensor: np.ndarray) -> list[Scene]:
-        """Known scenes that the robot may be in, nearest first, but not those it is still making."""
+    def scenes_to_align_with(self, T_odom_sensor: np.ndarray, ahead_m: float = 0.0) -> list[Scene]:
+        """Known scenes that the robot may be in, or come to within ahead_m, nearest first; not those in the making."""
         xy = self.localizer.predict(T_odom_sensor)[:2, 3]
         being_made = {visit.scene_id for visit in self.scenes.open_visits.values() if visit.number == 1}
-        near = self.scenes.scenes_near(xy, self.localizer.reach_m)
+        near = self.scenes.scenes_near(xy, self.localizer.reach_m + ahead_m)
         return [scene for scene in near if scene.scene_id not in being_made]
 
     def record(self, update: SceneUpdate) -> list[Instance]:
@@ -96,11 +99,20 @@ class Session:
             index.add_visit_scans(visit_id, visit.scan_ids)
             index.close_visit(visit_id, visit.t_out_ns)
             if visit.number >= 2:
-                where = (self.session_id, self.map_id, visit.scene_id, visit_id, visit.number)
-                due.append(Instance(*where, visit.t_in_ns, visit.t_out_ns))
+                due.append(
+                    Instance(
+                        self.session_id,
+                        self.map_id,
+                        visit.scene_id,
+                        visit_id,
+                        visit.number,
+                        visit.t_in_ns,
+                        visit.t_out_ns,
+                    )
+                )
         return due
 
-    def _load_reference(self, scene: Scene) -> np.ndarray:
-        """Points (N, 3) float32 of the scene's first visit, map frame."""
+    def _load_reference(self, scene: Scene) -> Iterator[Moments]:
+        """The cells of the scene's first visit, one scan after another, in the map."""
         first_visit = self._store.index.scans_of_scene(scene.scene_id, visit=1)
-        return reference_points(first_visit, self._store.scans, self._sensors, self._config.alignment.range_m)
+        return reference_cells(first_visit, self._store.scans, self._sensors, self._config.alignment)

@@ -70,6 +70,19 @@ class MergedChange:
     into_id: int
 
 
+@dataclass(frozen=True)
+class Observation:
+    """What a visit saw of a change: it `appeared`, `disappeared`, is `still` so, `gone` (undone), or `unseen`."""
+
+    kind: str
+    session: int
+    scene: int
+    visit: int  # number of the scene's visit
+    time_ns: int  # sensor's clock in `session`
+    share_still: float | None = None  # of its points, seen in its state; None where it was not looked for
+    share_undone: float | None = None  # ... and in the state before it
+
+
 class ChangeStore:
     """The open changes. Thread rule: any thread may call any method; one connection behind one lock."""
 
@@ -115,8 +128,8 @@ class ChangeStore:
         }
         with self._db.transaction():
             change_id = self._db.insert("changes", {**row, "revision": self._next_revision()})
-            where = {"session": change.session, "scene": change.scene, "visit": change.visit}
-            self._observe(change_id, change.polarity, **where, time_ns=change.first_seen_ns)
+            found = Observation(change.polarity, change.session, change.scene, change.visit, change.first_seen_ns)
+            self._note(change_id, found)
         return change_id
 
     def extend(self, change_id: int, points: np.ndarray, confidence: float, evidence: Mapping[str, Any]) -> None:
@@ -155,29 +168,18 @@ class ChangeStore:
             self._db.insert("merged_changes", row)
             self._db.write("DELETE FROM changes WHERE id = ?", (part_id,))
 
-    def observe(
-        self,
-        change_id: int,
-        kind: str,
-        *,
-        session: int,
-        scene: int,
-        visit: int,
-        time_ns: int,
-        superseded_by: int | None = None,
-        shares: tuple[float, float] | None = None,
-    ) -> None:
-        """Note what a later visit saw of the change: `still` there, `gone` (undone; by which change, if by one), or
-        nothing (`unseen`: no news, so the change's revision stays).
+    def observe(self, change_id: int, seen: Observation, superseded_by: int | None = None) -> None:
+        """Note what a later visit saw of the change; where it is gone, which change undid it, if one did.
 
-        shares: of its points, seen in its state and seen in the state before it.
+        That it was not seen is no news: the change's revision stays.
         """
         with self._db.transaction():
             self.get(change_id, with_points=False)
-            where = {"session": session, "scene": scene, "visit": visit}
-            self._observe(change_id, kind, **where, time_ns=time_ns, shares=shares)
-            if kind != "unseen":
-                self._update(change_id, {"state": "ended", "superseded_by": superseded_by} if kind == "gone" else {})
+            self._note(change_id, seen)
+            if seen.kind != "unseen":
+                self._update(
+                    change_id, {"state": "ended", "superseded_by": superseded_by} if seen.kind == "gone" else {}
+                )
 
     def transaction(self) -> AbstractContextManager[None]:
         """What is written inside is there whole or not at all: all that one instance found, for instance."""
@@ -279,27 +281,16 @@ class ChangeStore:
 
     # Parts of a transaction ---------------------------------------------------------------------------------------
 
-    def _observe(
-        self,
-        change_id: int,
-        kind: str,
-        *,
-        session: int,
-        scene: int,
-        visit: int,
-        time_ns: int,
-        shares: tuple[float, float] | None = None,
-    ) -> None:
-        share_still, share_undone = shares or (None, None)
+    def _note(self, change_id: int, seen: Observation) -> None:
         row = {
             "change_id": change_id,
-            "kind": kind,
-            "session_id": session,
-            "scene_id": scene,
-            "visit": visit,
-            "time_ns": time_ns,
-            "share_still": share_still,
-            "share_undone": share_undone,
+            "kind": seen.kind,
+            "session_id": seen.session,
+            "scene_id": seen.scene,
+            "visit": seen.visit,
+            "time_ns": seen.time_ns,
+            "share_still": seen.share_still,
+            "share_undone": seen.share_undone,
         }
         self._db.insert("observations", row)
 

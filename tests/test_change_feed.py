@@ -13,11 +13,11 @@ from click.testing import CliRunner
 from stored import make_change
 
 from revisitd.daemon.cli import cli
-from revisitd.storage.changes import ChangeStore, MergedChange
+from revisitd.storage.changes import ChangeStore, MergedChange, Observation
 from revisitd.storage.schema import CHANGES_V1, CHANGES_V2
 from revisitd.storage.store import Store
 
-HERE = {"session": 1, "scene": 1, "visit": 3, "time_ns": 5}
+GONE = Observation("gone", session=1, scene=1, visit=3, time_ns=5)
 
 
 @pytest.fixture
@@ -43,14 +43,14 @@ def test_new_changes_come_in_the_order_of_their_commits(store):
 def test_an_altered_change_comes_again_as_it_is_now(store):
     first, second = (store.changes.add(make_change(at=(x, 0.0, 0.0))) for x in (0.0, 5.0))
     seen = last_revision(store)
-    store.changes.observe(first, "gone", **HERE, superseded_by=second)
+    store.changes.observe(first, GONE, superseded_by=second)
     (entry,) = store.changes.since(seen)
     assert (entry.id, entry.state, entry.superseded_by) == (first, "ended", second)
 
 
 def test_a_merged_change_is_seen_to_go_and_what_it_altered_to_change(store):
     whole, part, ended = (store.changes.add(make_change(at=(x, 0.0, 0.0))) for x in (0.0, 5.0, 9.0))
-    store.changes.observe(ended, "gone", **HERE, superseded_by=part)
+    store.changes.observe(ended, GONE, superseded_by=part)
     seen = last_revision(store)
     store.changes.merge(part, whole)
     assert sorted(entries(store, seen)) == [(whole, False), (part, True), (ended, False)]
@@ -65,7 +65,7 @@ def test_a_reader_that_applies_the_feed_holds_what_the_store_holds(store):
             if step % 7 == 6:
                 store.changes.merge(known[-1], known[0])
             elif step % 5 == 4:
-                store.changes.observe(known[step % len(known)], "gone", **HERE)
+                store.changes.observe(known[step % len(known)], GONE)
             else:
                 store.changes.add(make_change(at=(step, 0.0, 0.0)))
             if step % 3 == 0:

@@ -9,6 +9,7 @@ from revisitd.daemon.changes import ChangeManager, Finding
 from revisitd.daemon.detection.erasure import update_map
 from revisitd.daemon.detection.results import DetectedObject, KnownState
 from revisitd.daemon.detection.submap import Submap
+from revisitd.daemon.worker import Instance
 from revisitd.storage.store import Store
 
 S = 1_000_000_000
@@ -82,7 +83,8 @@ def test_two_ends_of_a_car_are_one_once_a_third_view_joins_them(store):
     assert not manager.record(found("appeared", block(1.3, 0, size=1.5), 10, 64), finding(2))
     (whole,) = store.changes()
     assert store.whole_of(2) == store.whole_of(1) == whole.id
-    manager.note([KnownState(2, 1.0, 0.0)], {"session": 1, "scene": 1, "visit": 2}, 70 * S)  # asked before it merged
+    visit = Instance(session_id=1, map_id=1, scene_id=1, visit_id=2, visit=2, t_in_ns=50 * S, t_out_ns=70 * S)
+    manager.note([KnownState(2, 1.0, 0.0)], visit)  # asked before it merged
     assert [row["kind"] for row in store.history(whole.id)] == ["appeared", "appeared", "still"]
     np.testing.assert_allclose([whole.box_min[0], whole.box_max[0]], [0, 4], atol=0.1)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stored import make_change
 
-from revisitd.storage.changes import ChangeStore
+from revisitd.storage.changes import ChangeStore, Observation
 from revisitd.storage.errors import StorageError
 from revisitd.storage.schema import CHANGES_MIGRATIONS
 
@@ -91,15 +91,15 @@ def test_a_change_that_is_not_there_is_named(store, call):
         elif call == "extend":
             store.extend(17, make_change().points, 0.5, {})
         else:
-            store.observe(17, "still", session=1, scene=1, visit=3, time_ns=5)
+            store.observe(17, Observation("still", session=1, scene=1, visit=3, time_ns=5))
 
 
 def test_a_change_has_a_history(store):
     change_id = store.add(make_change(first_seen_ns=10))
-    store.observe(change_id, "still", session=1, scene=1, visit=3, time_ns=20)
+    store.observe(change_id, Observation("still", session=1, scene=1, visit=3, time_ns=20))
     assert store.get(change_id).state == "present"
     reverse = store.add(make_change("disappeared", visit=4))
-    store.observe(change_id, "gone", session=1, scene=1, visit=4, time_ns=30, superseded_by=reverse)
+    store.observe(change_id, Observation("gone", session=1, scene=1, visit=4, time_ns=30), superseded_by=reverse)
     found = store.get(change_id)
     assert (found.state, found.superseded_by) == ("ended", reverse)
     assert [(row["kind"], row["visit"], row["time_ns"]) for row in store.history(change_id)] == [
@@ -112,7 +112,7 @@ def test_a_change_has_a_history(store):
 def test_everything_new_or_altered_has_a_higher_revision(store):
     first, second = store.add(make_change()), store.add(make_change())
     store.extend(first, make_change(at=(1, 0, 0)).points, 0.5, {})
-    store.observe(second, "still", session=1, scene=1, visit=3, time_ns=20)
+    store.observe(second, Observation("still", session=1, scene=1, visit=3, time_ns=20))
     assert [store.get(change_id).revision for change_id in (first, second)] == [3, 4]
 
 

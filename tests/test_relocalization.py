@@ -12,7 +12,7 @@ from revisitd.daemon.geometry import inverse, transform
 from revisitd.daemon.joining import Joiner
 from revisitd.daemon.moments import in_order
 from revisitd.daemon.plan import PlacePlan, ScanPlan
-from revisitd.daemon.registration import surface_of
+from revisitd.daemon.registration import MAX_SCAN_POINTS, MAX_SURFACE_POINTS, scan_cloud, surface_of
 from revisitd.daemon.relocalization import COARSE_VOXEL_M, Answer, Place, Verifier, best_guesses, same_pose, verdict
 
 ALIGNMENT = Config().alignment
@@ -86,6 +86,14 @@ def test_a_place_without_anything_upright_is_refused():
     x, y = np.meshgrid(np.arange(-30, 30, 0.3), np.arange(-30, 30, 0.3))
     field = np.column_stack([x.ravel(), y.ravel(), 0.02 * np.sin(x.ravel())]).astype(np.float32)
     assert "nothing stored looks like it" in located(field, pose(0, 0, HEIGHT_M)).reason
+
+
+def test_clutter_all_around_is_thinned_to_what_can_be_registered_in_time():
+    """Rain, leaves or noise in every voxel."""
+    clutter = np.random.default_rng(0).uniform(-30, 30, (220_000, 3)).astype(np.float32)
+    assert 0.5 * MAX_SCAN_POINTS < scan_cloud(clutter, ALIGNMENT.voxel_m, ALIGNMENT.range_m).size() <= MAX_SCAN_POINTS
+    surface = surface_of(clutter, ALIGNMENT.voxel_m)
+    assert 0.5 * MAX_SURFACE_POINTS < surface.cloud.size() <= MAX_SURFACE_POINTS
 
 
 class Asked:

@@ -2,15 +2,12 @@
 
 import numpy as np
 import pytest
-import yard
 from stored import SESSION, add_visit
 
 from revisitd.daemon import submap_build
 from revisitd.daemon.comparison import MIN_SCANS
 from revisitd.daemon.config import Config
-from revisitd.daemon.localization import Localizer
-from revisitd.daemon.references import reference_points
-from revisitd.daemon.scenes import Scene
+from revisitd.daemon.references import reference_cells, reference_points
 from revisitd.storage.errors import ScanFileError
 from revisitd.storage.store import Store
 
@@ -55,15 +52,20 @@ def test_references_of_which_none_is_left_are_an_error_with_a_name(store, each_i
         reference_points(store.index.scans_of_scene(2, visit=1), store.scans, AnySensor(), 60.0)
 
 
-def test_a_scene_without_references_leaves_the_prediction_as_it_is():
-    def gone(scene):
-        raise ScanFileError("no scan of the scene's first visit can be read")
+def test_what_a_key_scan_is_fitted_to_does_without_a_scan_that_has_just_been_deleted(store, monkeypatch):
+    class Swept:
+        def __init__(self, scan):
+            self.scan_id = scan.scan_id
 
-    pose = yard.pose(1.0, -2.0, 0.4)
-    points = np.random.default_rng(0).uniform(-10.0, 10.0, (5000, 3)).astype(np.float32)
-    fix = Localizer(Config().alignment, gone, np.eye(4)).locate(points, pose, [Scene(1, np.zeros((1, 2)))])
-    assert not fix.aligned and "first visit" in fix.reason
-    np.testing.assert_array_equal(fix.T_map_sensor, pose)
+        def in_map(self, *_):
+            return self.scan_id
+
+    monkeypatch.setattr("revisitd.daemon.references.sweep_of", lambda scan, *_: Swept(scan))
+    first_visit = store.index.scans_of_scene(1, visit=1)
+    cells = reference_cells(first_visit, store.scans, AnySensor(), Config().alignment)
+    assert next(cells) == 1
+    store.scans.delete([(1, i) for i in range(2, 20)])
+    assert list(cells) == [20]
 
 
 def test_a_submap_does_without_scans_that_cannot_be_read(store, monkeypatch):

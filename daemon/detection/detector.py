@@ -74,7 +74,10 @@ def _one_way(polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thre
     this = side.standing.only(is_far)
     this = this.only(dense_enough(this.points, t.rho_m, t.n))
     watch.lap("noise")
-    confirmed, possible, open_ = _evidence(this, other.standing, t, glimpses=False)
+    evidence = _Evidence(this, other.standing, t)
+    confirmed = evidence.confirmed()
+    possible = evidence.possible(confirmed)
+    in_vain = this.points[possible & evidence.in_vain()]
     watch.lap("occlusion")
     objects = []
     for member in _objects(this.points, confirmed, possible, t.cluster_distance_m):
@@ -86,7 +89,7 @@ def _one_way(polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thre
             continue
         if is_ground_like(this.points[kept], other.ground, t.ground_filter_c1_m, t.ground_filter_c2):
             continue
-        more = _completion(this.points[sure], this.points[open_], side, other, t)
+        more = _completion(this.points[sure], in_vain, side, other, t)
         found = _described(polarity, this, member, sure, more, other.standing, t)
         if found is not None and not _is_grass(found, other.ground):
             objects.append(found)
@@ -139,27 +142,40 @@ def _both(whole: DetectedObject, part: DetectedObject) -> DetectedObject:
     )
 
 
-def _evidence(this: Submap, other: Submap, t: Thresholds, glimpses: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of points that stayed through their own visit, three times (N,) bool: which were looked through by the other
-    one; which may have been; and to which it looked, in vain: no return from there, nor from anything before it.
+class _Evidence:
+    """What is known of the points of a submap by the scans of the other side and of their own."""
 
-    glimpses: for points beside what is sure already, half the margin behind them and glimpses are enough."""
-    sight_limits = (0.5 if glimpses else 1.0) * t.occlusion_margin_m, t.occlusion_range_m
-    seen = latest_sight(this.points, other, *sight_limits, t.min_confirming_scans)
-    arrivals = this.visit.min() > other.visit.max()  # what left in the middle of an older visit was only passing by
-    stay = t.min_showing_scans, t.min_showing_s, glimpses, arrivals
+    def __init__(self, this: Submap, other: Submap, t: Thresholds, glimpses: bool = False):
+        """glimpses: for points beside what is sure already, half the margin behind them and glimpses are enough."""
+        self._this, self._t, self._glimpses = this, t, glimpses
+        self._limits = (0.5 if glimpses else 1.0) * t.occlusion_margin_m, t.occlusion_range_m
+        self._arrivals = this.visit.min() > other.visit.max()  # what left in an older visit was only passing by
+        self._seen = latest_sight(this.points, other, *self._limits, t.min_confirming_scans)
 
-    def stayed(asked: np.ndarray) -> np.ndarray:
-        asked[asked] = persistent(this.points[asked], this.scan[asked], this, *sight_limits, *stay)
+    def confirmed(self) -> np.ndarray:
+        """Which points stayed through their own visit, and were looked through by the other: (N,) bool."""
+        return self._stayed(self._looked_through())
+
+    def possible(self, confirmed: np.ndarray) -> np.ndarray:
+        """Which points may belong to an object as well, (N,) bool: around confirmed ones, and nothing against them."""
+        possible = (self._seen.at <= self._seen.through) & ~self._looked_through()
+        points = self._this.points
+        possible[possible] = ~changed(points[possible], points[confirmed], COMPLETE_M, 1)
+        return self._stayed(possible) | confirmed
+
+    def in_vain(self) -> np.ndarray:
+        """To which points the other visit looked, (N,) bool: no return from there, nor from anything before it."""
+        seen = self._seen
+        return (seen.at == 0) & (seen.through + seen.open >= self._t.min_confirming_scans)
+
+    def _looked_through(self) -> np.ndarray:
+        return (self._seen.through >= self._t.min_confirming_scans) & (self._seen.through > self._seen.at)
+
+    def _stayed(self, asked: np.ndarray) -> np.ndarray:
+        this, t = self._this, self._t
+        stay = t.min_showing_scans, t.min_showing_s, self._glimpses, self._arrivals
+        asked[asked] = persistent(this.points[asked], this.scan[asked], this, *self._limits, *stay)
         return asked
-
-    confirmed = stayed((seen.through >= t.min_confirming_scans) & (seen.through > seen.at))
-    # What else may belong to an object lies around confirmed points; the rest of the candidates, most of them, wait.
-    possible = seen.at <= seen.through
-    possible[possible] = ~changed(this.points[possible], this.points[confirmed], COMPLETE_M, 1)
-    possible = stayed(possible) | confirmed
-    in_vain = (seen.at == 0) & (seen.through + seen.open >= t.min_confirming_scans)
-    return confirmed, possible, in_vain & possible
 
 
 def _completion(sure: np.ndarray, in_vain: np.ndarray, side: Side, other: Side, t: Thresholds) -> np.ndarray:
@@ -220,7 +236,7 @@ def _looked_through_around(points: np.ndarray, side: Side, other: Side, t: Thres
     near = near.only(_first_of_voxels(near.points))
     for ground in (side.ground, other.ground):
         near = near.only(~ground.is_under(near.points, t.ground_sigmas, t.ground_min_sigma_m))
-    return near.only(_evidence(near, other.standing, t, glimpses)[0])
+    return near.only(_Evidence(near, other.standing, t, glimpses).confirmed())
 
 
 def _described(

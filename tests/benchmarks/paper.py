@@ -26,7 +26,7 @@ from scoring import Score, capture, score
 
 from revisitd.daemon.comparison import Job, Selection
 from revisitd.daemon.config import Config
-from revisitd.daemon.detection import ground
+from revisitd.daemon.detection import detector, ground
 from revisitd.daemon.replay import replay
 from revisitd.daemon.sensors import Sensors
 from revisitd.daemon.views import map_points
@@ -98,13 +98,18 @@ def no_ground(points, *_):
     return np.zeros(len(points), bool), ground._ground(*nothing)
 
 
-def everything_confirmed(this, other, t, glimpses):
+class EverythingConfirmed(detector._Evidence):
     """The evidence of a detector that does not ask what the other visit saw."""
-    return (np.ones(len(this.points), bool),) * 3
+
+    def confirmed(self):
+        return np.ones(len(self._this.points), bool)
+
+    def possible(self, confirmed):
+        return confirmed
 
 
 NO_OCCLUSION = {
-    "_evidence": everything_confirmed,
+    "_Evidence": EverythingConfirmed,
     "scans_looking_through": lambda points, images, *_: np.arange(len(images)),
     "_completion": lambda sure, *_: sure[:0],
     "_counterparts": lambda *_: [],
