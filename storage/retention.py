@@ -27,7 +27,7 @@ BLOCK_BYTES = 4096  # a file takes whole blocks
 HIGH, LOW = 0.99, 0.98  # of the quota
 SCANS_PER_STEP = 50  # some 10 ms
 SCANS_PER_PLAN = 500
-PLAN_S = 60.0  # what was least useful a minute ago may be evidence now
+PLAN_S = 300.0  # what was least useful some minutes ago may be evidence now
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,7 @@ class Victim:
 
 
 ORDER = """
-WITH latest AS (SELECT scene_id, max(number) AS number, max(visit_id) AS latest_id FROM visits GROUP BY scene_id),
-evidence AS (                          -- the visits that showed a change, and the last ones before it
+WITH evidence AS (                          -- the visits that showed a change, and the last ones before it
     SELECT v.visit_id FROM precious.changes AS c JOIN visits AS v ON v.scene_id = c.scene_id AND v.number = c.visit
     UNION
     SELECT v.visit_id FROM precious.changes AS c JOIN visits AS v
@@ -61,13 +60,16 @@ members AS (                           -- the first scan of each of `kept` equal
     FROM ways
 ),
 needs AS (
-    SELECT scan_id, max(CASE
-               WHEN NOT spare AND (v.number = 1 OR v.number = latest.number) THEN 5
+    SELECT scan_id, max(latest_id) AS seen_last, max(visit_id) AS visit_id, max(CASE
+               WHEN NOT spare AND (number = 1 OR visit_id = latest_id) THEN 5
                WHEN visit_id IN evidence THEN iif(spare, 3, 4)
                WHEN spare THEN 0
-               ELSE 2 END) AS tier,
-           max(visit_id) AS visit_id, max(latest_id) AS seen_last
-    FROM members JOIN visits AS v USING (visit_id) JOIN latest USING (scene_id) GROUP BY scan_id
+               ELSE 2 END) AS tier
+    FROM (SELECT members.*, number,
+                 (SELECT visit_id FROM visits AS other WHERE other.scene_id = v.scene_id ORDER BY number DESC LIMIT 1)
+                 AS latest_id
+          FROM members JOIN visits AS v USING (visit_id))
+    GROUP BY scan_id
 ),
 newest AS (
     SELECT session_id, max(stamp_ns) AS stamp_ns FROM scans WHERE session_id = (SELECT max(session_id) FROM sessions)
@@ -93,5 +95,6 @@ def least_useful(data_dir: DataDir, n: int, kept_per_visit: int, recent_ns: int)
     """
     with closing(database.open_reader(data_dir.index_path, len(INDEX_MIGRATIONS))) as db:
         db.attach(data_dir.changes_path, "precious", len(CHANGES_MIGRATIONS))
+        db.write("PRAGMA temp_store = MEMORY")  # not on the disk, which may be full: 60 MB for 100 000 scans
         values = {"kept": kept_per_visit, "recent_ns": recent_ns, "n": n}
         return [Victim(*row[:3], Tier(row[3])) for row in db.tuples(ORDER, values)]
