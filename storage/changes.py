@@ -86,6 +86,11 @@ class ChangeStore:
         """Open read-only, beside the writer. Raises DatabaseFileError, NewerFormat."""
         return cls(database.open_reader(path, len(CHANGES_MIGRATIONS)))
 
+    def read_through(self) -> None:
+        """Read every row as the program does. Raises DatabaseCorrupt."""
+        for change in self.changes():
+            self.history(change.id)
+
     def close(self) -> None:
         self._db.close()
 
@@ -275,7 +280,8 @@ class ChangeStore:
         rows = self._db.rows(
             f"SELECT {columns} FROM changes WHERE {where} ORDER BY session_id, first_seen_ns, id", values
         )
-        return [_change_object(row) for row in rows]
+        with self._db.decoding():
+            return [_change_object(row) for row in rows]
 
     # Parts of a transaction ---------------------------------------------------------------------------------------
 

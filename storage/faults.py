@@ -35,6 +35,8 @@ _OF_SQLITE: tuple[tuple[str, type[StorageError], str], ...] = (
     ("is locked", StorageBusy, "another program writes to it: end that, or let it commit"),
     ("disk I/O error", StorageUnavailable, FAILING),
     ("malformed", DatabaseCorrupt, "damaged: the next start of the daemon mends it"),
+    ("Could not decode", DatabaseCorrupt, "damaged: the next start of the daemon mends it"),
+    ("unsupported file format", DatabaseCorrupt, "damaged: the next start of the daemon mends it"),
     ("not a database", DatabaseCorrupt, "not a database: the next start of the daemon mends it"),
 )
 

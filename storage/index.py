@@ -39,6 +39,13 @@ class IndexStore:
         """Open read-only, beside the writer. Raises DatabaseFileError, NewerFormat."""
         return cls(database.open_reader(path, len(INDEX_MIGRATIONS)))
 
+    def read_through(self) -> None:
+        """Read every row as the program does. Raises DatabaseCorrupt."""
+        self.trajectory()
+        for scene in self.scenes():
+            self.visits(scene.scene_id)
+            self.scans_of_scene(scene.scene_id)
+
     def close(self) -> None:
         self.db.close()
 
@@ -149,14 +156,16 @@ class IndexStore:
         """Poses of all key scans, or of one session's."""
         where, values = ("WHERE s.session_id = ?", (session,)) if session is not None else ("", ())
         rows = self.db.tuples(f"SELECT {POSE} FROM scans AS s {where} ORDER BY s.scan_id", values)
-        return Trajectory(**_trajectory_columns(rows))
+        with self.db.decoding():
+            return Trajectory(**_trajectory_columns(rows))
 
     def all_descriptors(self, model_id: str) -> tuple[np.ndarray, np.ndarray]:
         """Scan ids (N,) int64, ascending, and descriptors (N, D) float32 of all scans described by this model."""
         rows = self.db.tuples(
             "SELECT scan_id, descriptor FROM descriptors WHERE model_id = ? ORDER BY scan_id", (model_id,)
         )
-        return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
+        with self.db.decoding():
+            return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
 
     def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of all scans in scenes of some maps, described by this model: scene (N,), map (N,), descriptor (N, D)."""
@@ -168,8 +177,9 @@ class IndexStore:
                 WHERE d.model_id = ? AND s.map_id IN ({", ".join("?" * len(maps))}) ORDER BY s.scene_id, scan_id""",
             (model_id, *maps),
         )
-        scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
-        return scene, map_id, _descriptors([row[2] for row in rows])
+        with self.db.decoding():
+            scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
+            return scene, map_id, _descriptors([row[2] for row in rows])
 
     def count_scans(self) -> int:
         """Key scans in the store."""
@@ -202,7 +212,8 @@ class IndexStore:
                 FROM scenes {where} ORDER BY scene_id""",
             values,
         )
-        return [SceneRow(**{**row, "hull": np.array(json.loads(row["hull"])).reshape(-1, 2)}) for row in rows]
+        with self.db.decoding():
+            return [SceneRow(**{**row, "hull": np.array(json.loads(row["hull"])).reshape(-1, 2)}) for row in rows]
 
     def open_visit(self, scene_id: int, number: int, session: int, t_in_ns: int) -> int:
         """Note that a visit began; its id."""
@@ -241,12 +252,13 @@ class IndexStore:
                 WHERE v.scene_id = ? {where} ORDER BY s.scan_id""",
             values,
         )
-        return SceneScans(
-            **_trajectory_columns(rows),
-            visit_number=np.array([row[11] for row in rows], np.int64),
-            model_id=np.array([row[12] for row in rows], np.str_),
-            descriptors=_descriptors([row[13] for row in rows]),
-        )
+        with self.db.decoding():
+            return SceneScans(
+                **_trajectory_columns(rows),
+                visit_number=np.array([row[11] for row in rows], np.int64),
+                model_id=np.array([row[12] for row in rows], np.str_),
+                descriptors=_descriptors([row[13] for row in rows]),
+            )
 
     def latest_visit_numbers(self) -> dict[int, int]:
         """Scan id -> the highest number among the visits it is part of; scans outside all scenes are left out."""
