@@ -22,6 +22,7 @@ from .files import sync_dir
 logger = logging.getLogger(__name__)
 
 ROWS_PER_LINE = 100  # a torn line costs no more than these
+TAIL_BYTES = 4_000_000  # hold several lines; without a whole one in them all is noted once more, and does no harm
 Id = Annotated[int, Field(ge=0, lt=1 << 63)]
 Row = dict[str, Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | float | str | None]
 
@@ -60,9 +61,8 @@ class PlacesLog:
 
     def __init__(self, path: Path, index: database.Connection):
         self._path, self._index = path, index
-        self._up_to = UpTo()
-        for line in read(path):
-            self._up_to = line.up_to
+        last = _last_line(path)
+        self._up_to = last.up_to if last else UpTo()
 
     def catch_up(self) -> None:
         """Append what the index holds and the file does not. Raises StorageUnavailable, OSError: then the next
@@ -110,13 +110,31 @@ def read(path: Path) -> Iterator[Line]:
         return
     with open(path, "rb") as file:
         for text in file:
-            checksum, _, content = text.rstrip(b"\n").partition(b" ")
-            if checksum != b"%08x" % zlib.crc32(content):
-                continue
-            try:
-                yield Line.model_validate_json(content)
-            except ValidationError as error:
-                logger.error("%s: a line is not laid out as it should be: %d errors", path, error.error_count())
+            line = _whole_line(text)
+            if line is not None:
+                yield line
+
+
+def _last_line(path: Path) -> Line | None:
+    """The last whole line, without reading years of them."""
+    if not path.exists():
+        return None
+    with open(path, "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - TAIL_BYTES))
+        texts = file.read().splitlines()
+    return next((line for text in reversed(texts) if (line := _whole_line(text)) is not None), None)
+
+
+def _whole_line(text: bytes) -> Line | None:
+    checksum, _, content = text.rstrip(b"\n").partition(b" ")
+    if checksum != b"%08x" % zlib.crc32(content):
+        return None
+    try:
+        return Line.model_validate_json(content)
+    except ValidationError as error:
+        logger.error("a line of places.jsonl is not laid out as it should be: %d errors", error.error_count())
+        return None
 
 
 def _append(path: Path, line: Line) -> None:
