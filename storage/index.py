@@ -15,12 +15,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import database
-from .rows import DueVisit, InstanceRow, SceneRow, SceneScans, SessionRow, Trajectory, VisitRow
+from .rows import (
+    POSE,
+    DueVisit,
+    InstanceRow,
+    SceneRow,
+    SceneScans,
+    SessionRow,
+    Trajectory,
+    VisitRow,
+    descriptor_array,
+    trajectory_columns,
+)
 from .scans import Scan
 from .schema import INDEX_MIGRATIONS
 
 BUSY_TIMEOUT_S = 0.2  # the frame loop writes here: it may be late by two frames, then it goes on without
-POSE = "s.scan_id, s.session_id, s.stamp_ns, s.aligned, s.x, s.y, s.z, s.qx, s.qy, s.qz, s.qw"
 
 
 class IndexStore:
@@ -157,7 +167,7 @@ class IndexStore:
         where, values = ("WHERE s.session_id = ?", (session,)) if session is not None else ("", ())
         rows = self.db.tuples(f"SELECT {POSE} FROM scans AS s {where} ORDER BY s.scan_id", values)
         with self.db.decoding():
-            return Trajectory(**_trajectory_columns(rows))
+            return Trajectory(**trajectory_columns(rows))
 
     def all_descriptors(self, model_id: str) -> tuple[np.ndarray, np.ndarray]:
         """Scan ids (N,) int64, ascending, and descriptors (N, D) float32 of all scans described by this model."""
@@ -165,7 +175,7 @@ class IndexStore:
             "SELECT scan_id, descriptor FROM descriptors WHERE model_id = ? ORDER BY scan_id", (model_id,)
         )
         with self.db.decoding():
-            return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
+            return np.array([row[0] for row in rows], np.int64), descriptor_array([row[1] for row in rows])
 
     def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of all scans in scenes of some maps, described by this model: scene (N,), map (N,), descriptor (N, D)."""
@@ -179,7 +189,7 @@ class IndexStore:
         )
         with self.db.decoding():
             scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
-            return scene, map_id, _descriptors([row[2] for row in rows])
+            return scene, map_id, descriptor_array([row[2] for row in rows])
 
     def count_scans(self) -> int:
         """Key scans in the store."""
@@ -254,10 +264,10 @@ class IndexStore:
         )
         with self.db.decoding():
             return SceneScans(
-                **_trajectory_columns(rows),
+                **trajectory_columns(rows),
                 visit_number=np.array([row[11] for row in rows], np.int64),
                 model_id=np.array([row[12] for row in rows], np.str_),
-                descriptors=_descriptors([row[13] for row in rows]),
+                descriptors=descriptor_array([row[13] for row in rows]),
             )
 
     def latest_visit_numbers(self) -> dict[int, int]:
@@ -299,24 +309,3 @@ class IndexStore:
 
     def _next_id(self, table: str) -> int:
         return self.db.value("SELECT coalesce(max(seq), 0) + 1 FROM sqlite_sequence WHERE name = ?", (table,))
-
-
-def _trajectory_columns(rows: list[tuple]) -> dict[str, np.ndarray]:
-    """Rows that begin with POSE -> the columns of a Trajectory."""
-    poses = np.array([row[4:11] for row in rows], np.float64).reshape(-1, 7)
-    T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
-    if rows:
-        T_map_sensor[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
-        T_map_sensor[:, :3, 3] = poses[:, :3]
-    return {
-        "scan_id": np.array([row[0] for row in rows], np.int64),
-        "session": np.array([row[1] for row in rows], np.int64),
-        "stamp_ns": np.array([row[2] for row in rows], np.int64),
-        "aligned": np.array([row[3] for row in rows], bool),
-        "T_map_sensor": T_map_sensor,
-    }
-
-
-def _descriptors(blobs: list[bytes]) -> np.ndarray:
-    """Equal-length blobs of float32 -> (N, D) float32."""
-    return np.frombuffer(b"".join(blobs), "<f4").reshape(len(blobs), -1 if blobs else 0).astype(np.float32)
