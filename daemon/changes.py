@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..storage.changes import Change, ChangeObject, ChangeStore, Observation
+from ..storage.changerows import Change, ChangeObject, Observation
+from ..storage.changes import ChangeStore
 from .confidence import confidence
 from .detection.results import ERASE_M, DetectedObject, Erasure, KnownChange, KnownState
 from .worker import Instance

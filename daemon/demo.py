@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..storage.changes import ChangeObject
+from ..storage.changerows import ChangeObject
 from ..storage.store import Store
 
 MATCH_M = 1.0  # CDSD section V-A: same polarity, within a metre

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from ..storage.changes import ChangeObject, ChangeStore, MergedChange
+from ..storage.changerows import ChangeObject, MergedChange
+from ..storage.changes import ChangeStore
 from .report import change_fields
 
 POLL_S = 0.5

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from scipy.ndimage import distance_transform_edt, median_filter
 
-from ..storage.changes import ChangeObject
+from ..storage.changerows import ChangeObject
 from ..storage.rows import SceneRow
 from .closeups import draw_close_ups
 from .hull import convex_hull

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..storage.changes import ChangeObject
+from ..storage.changerows import ChangeObject
 from ..storage.errors import DataDirError
 from ..storage.rows import SceneRow, SessionRow, Trajectory
 from ..storage.store import Store

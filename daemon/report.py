@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..storage.changes import ChangeObject
+from ..storage.changerows import ChangeObject
 
 if TYPE_CHECKING:  # its compiled loops take a second to import
     from .places import PlaceSeen

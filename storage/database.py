@@ -83,6 +83,18 @@ class Connection:
         with self._using():
             return self._db.execute(sql, values).fetchone()[0]
 
+    @contextmanager
+    def decoding(self) -> Iterator[None]:
+        """Around the use of what was read: what this program never writes into a row is damage. Raises DatabaseCorrupt.
+
+        Readers are not kept waiting for a check of the file when they open it.
+        """
+        try:
+            yield
+        except (TypeError, ValueError, OverflowError) as error:
+            self._suspect()
+            raise DatabaseCorrupt(f"{self._path}: damaged: a row holds what was never written: {error}") from error
+
     def attach(self, path: Path, name: str, n_migrations: int) -> None:
         """Read another database too, under a name; for readers. Raises DatabaseFileError, NewerFormat."""
         open_reader(path, n_migrations).close()
@@ -139,9 +151,12 @@ class Connection:
                 with naming(self._path):
                     yield
             except DatabaseCorrupt:
-                if self._writes:
-                    suspicion(self._path).touch()
+                self._suspect()
                 raise
+
+    def _suspect(self) -> None:
+        if self._writes:
+            suspicion(self._path).touch()
 
 
 def version(path: Path) -> int:
@@ -171,7 +186,7 @@ def open_writer(
         connection = sqlite3.connect(path, OPENING_TIMEOUT_S, isolation_level=None, check_same_thread=False)
         try:
             _refuse_newer(connection, path, len(migrations))
-            _check(connection, path)
+            _check(connection, path, migrations)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute(f"PRAGMA synchronous = {synchronous}")
             connection.execute("PRAGMA foreign_keys = ON")
@@ -211,8 +226,14 @@ def _connect_read_only(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(_read_only_uri(path), OPENING_TIMEOUT_S, **how)
 
 
-def _check(connection: sqlite3.Connection, path: Path) -> None:
+def _check(connection: sqlite3.Connection, path: Path, migrations: Sequence[str]) -> None:
     """Read the file through, for a second at most, or wholly where damage was met in use. Raises DatabaseCorrupt."""
+    applied = migrations[: connection.execute("PRAGMA user_version").fetchone()[0]]
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as fresh:
+        fresh.executescript(";".join(applied))
+        missing = _columns(fresh) - _columns(connection)
+    if missing:
+        raise DatabaseCorrupt(f"{path}: damaged: {' '.join(sorted(missing)[0])} is missing")
     doubt = suspicion(path)
     if doubt.exists():
         problems = connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
@@ -221,6 +242,15 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
     if problems != "ok":
         raise DatabaseCorrupt(f"{path}: damaged: {problems.splitlines()[-1]}")
     doubt.unlink(missing_ok=True)
+
+
+def _columns(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
+    """Names and types of all columns of all tables and views: SQLite's check of a file does not know them."""
+    return set(
+        connection.execute(
+            "SELECT t.type, t.name, c.name, c.type FROM sqlite_schema AS t JOIN pragma_table_info(t.name) AS c"
+        )
+    )
 
 
 def _quick_check(connection: sqlite3.Connection) -> str:

@@ -157,7 +157,7 @@ def _read_identity(path: Path) -> str:
     try:
         identity = json.loads(file.read_text(encoding="utf-8"))
         version, known = int(identity["version"]), identity["format"] == FORMAT
-        name = str(uuid.UUID(identity["uuid"]))
+        name = str(uuid.UUID(str(identity["uuid"])))
     except (FileNotFoundError, NotADirectoryError):
         raise DataDirError(f"{path}: not a revisitd data directory (no revisitd.json)") from None
     except (ValueError, KeyError, TypeError) as error:

@@ -20,6 +20,7 @@ from .errors import (
 
 FULL = "no space left: free some, or lower storage.quota_gb"
 READ_ONLY = "cannot be written: the file system, or the file, is read-only"
+DAMAGED = "damaged: the next start of the daemon mends it"
 FAILING = "the disk fails to read or write: see dmesg and smartctl"
 
 _OF_SYSTEM: dict[int, tuple[type[StorageError], str]] = {
@@ -34,7 +35,9 @@ _OF_SQLITE: tuple[tuple[str, type[StorageError], str], ...] = (
     ("readonly database", StorageReadOnly, READ_ONLY),
     ("is locked", StorageBusy, "another program writes to it: end that, or let it commit"),
     ("disk I/O error", StorageUnavailable, FAILING),
-    ("malformed", DatabaseCorrupt, "damaged: the next start of the daemon mends it"),
+    ("malformed", DatabaseCorrupt, DAMAGED),
+    ("Could not decode", DatabaseCorrupt, DAMAGED),
+    ("unsupported file format", DatabaseCorrupt, DAMAGED),
     ("not a database", DatabaseCorrupt, "not a database: the next start of the daemon mends it"),
 )
 
@@ -52,6 +55,8 @@ def naming(path: Path) -> Iterator[None]:
         raise
     except sqlite3.DatabaseError as error:
         raise of_sqlite(path, error) from error
+    except UnicodeDecodeError as error:  # SQLite names what it found damaged, and Python cannot read the name
+        raise DatabaseCorrupt(f"{path}: {DAMAGED}") from error
     except OSError as error:
         if error.errno not in _OF_SYSTEM:
             raise

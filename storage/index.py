@@ -15,12 +15,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import database
-from .rows import DueVisit, InstanceRow, SceneRow, SceneScans, SessionRow, Trajectory, VisitRow
+from .rows import (
+    POSE,
+    DueVisit,
+    InstanceRow,
+    SceneRow,
+    SceneScans,
+    SessionRow,
+    Trajectory,
+    VisitRow,
+    descriptor_array,
+    trajectory_columns,
+)
 from .scans import Scan
 from .schema import INDEX_MIGRATIONS
 
 BUSY_TIMEOUT_S = 0.2  # the frame loop writes here: it may be late by two frames, then it goes on without
-POSE = "s.scan_id, s.session_id, s.stamp_ns, s.aligned, s.x, s.y, s.z, s.qx, s.qy, s.qz, s.qw"
 
 
 class IndexStore:
@@ -38,6 +48,13 @@ class IndexStore:
     def open_reader(cls, path: Path) -> IndexStore:
         """Open read-only, beside the writer. Raises DatabaseFileError, NewerFormat."""
         return cls(database.open_reader(path, len(INDEX_MIGRATIONS)))
+
+    def read_through(self) -> None:
+        """Read every row as the program does. Raises DatabaseCorrupt."""
+        self.trajectory()
+        for scene in self.scenes():
+            self.visits(scene.scene_id)
+            self.scans_of_scene(scene.scene_id)
 
     def close(self) -> None:
         self.db.close()
@@ -149,14 +166,16 @@ class IndexStore:
         """Poses of all key scans, or of one session's."""
         where, values = ("WHERE s.session_id = ?", (session,)) if session is not None else ("", ())
         rows = self.db.tuples(f"SELECT {POSE} FROM scans AS s {where} ORDER BY s.scan_id", values)
-        return Trajectory(**_trajectory_columns(rows))
+        with self.db.decoding():
+            return Trajectory(**trajectory_columns(rows))
 
     def all_descriptors(self, model_id: str) -> tuple[np.ndarray, np.ndarray]:
         """Scan ids (N,) int64, ascending, and descriptors (N, D) float32 of all scans described by this model."""
         rows = self.db.tuples(
             "SELECT scan_id, descriptor FROM descriptors WHERE model_id = ? ORDER BY scan_id", (model_id,)
         )
-        return np.array([row[0] for row in rows], np.int64), _descriptors([row[1] for row in rows])
+        with self.db.decoding():
+            return np.array([row[0] for row in rows], np.int64), descriptor_array([row[1] for row in rows])
 
     def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of all scans in scenes of some maps, described by this model: scene (N,), map (N,), descriptor (N, D)."""
@@ -168,8 +187,9 @@ class IndexStore:
                 WHERE d.model_id = ? AND s.map_id IN ({", ".join("?" * len(maps))}) ORDER BY s.scene_id, scan_id""",
             (model_id, *maps),
         )
-        scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
-        return scene, map_id, _descriptors([row[2] for row in rows])
+        with self.db.decoding():
+            scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
+            return scene, map_id, descriptor_array([row[2] for row in rows])
 
     def count_scans(self) -> int:
         """Key scans in the store."""
@@ -202,7 +222,8 @@ class IndexStore:
                 FROM scenes {where} ORDER BY scene_id""",
             values,
         )
-        return [SceneRow(**{**row, "hull": np.array(json.loads(row["hull"])).reshape(-1, 2)}) for row in rows]
+        with self.db.decoding():
+            return [SceneRow(**{**row, "hull": np.array(json.loads(row["hull"])).reshape(-1, 2)}) for row in rows]
 
     def open_visit(self, scene_id: int, number: int, session: int, t_in_ns: int) -> int:
         """Note that a visit began; its id."""
@@ -241,12 +262,13 @@ class IndexStore:
                 WHERE v.scene_id = ? {where} ORDER BY s.scan_id""",
             values,
         )
-        return SceneScans(
-            **_trajectory_columns(rows),
-            visit_number=np.array([row[11] for row in rows], np.int64),
-            model_id=np.array([row[12] for row in rows], np.str_),
-            descriptors=_descriptors([row[13] for row in rows]),
-        )
+        with self.db.decoding():
+            return SceneScans(
+                **trajectory_columns(rows),
+                visit_number=np.array([row[11] for row in rows], np.int64),
+                model_id=np.array([row[12] for row in rows], np.str_),
+                descriptors=descriptor_array([row[13] for row in rows]),
+            )
 
     def latest_visit_numbers(self) -> dict[int, int]:
         """Scan id -> the highest number among the visits it is part of; scans outside all scenes are left out."""
@@ -287,24 +309,3 @@ class IndexStore:
 
     def _next_id(self, table: str) -> int:
         return self.db.value("SELECT coalesce(max(seq), 0) + 1 FROM sqlite_sequence WHERE name = ?", (table,))
-
-
-def _trajectory_columns(rows: list[tuple]) -> dict[str, np.ndarray]:
-    """Rows that begin with POSE -> the columns of a Trajectory."""
-    poses = np.array([row[4:11] for row in rows], np.float64).reshape(-1, 7)
-    T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
-    if rows:
-        T_map_sensor[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
-        T_map_sensor[:, :3, 3] = poses[:, :3]
-    return {
-        "scan_id": np.array([row[0] for row in rows], np.int64),
-        "session": np.array([row[1] for row in rows], np.int64),
-        "stamp_ns": np.array([row[2] for row in rows], np.int64),
-        "aligned": np.array([row[3] for row in rows], bool),
-        "T_map_sensor": T_map_sensor,
-    }
-
-
-def _descriptors(blobs: list[bytes]) -> np.ndarray:
-    """Equal-length blobs of float32 -> (N, D) float32."""
-    return np.frombuffer(b"".join(blobs), "<f4").reshape(len(blobs), -1 if blobs else 0).astype(np.float32)

@@ -1,35 +1,59 @@
 """places.jsonl: sessions, scenes and visits once more, from which a lost index.db is rebuilt beside the scan files.
 
-A scan file is written before it is known which visits its scan will be part of: they cannot be in it. Each line is
-the CRC-32 of its JSON in hex, a space, and the JSON: rows of the index's tables by their column names (a visit with
-its "scan_ids"), and "up_to", the highest ids written so far. Lines are only ever appended.
+A scan file is written before it is known which visits its scan will be part of: they cannot be in it. Each line is the
+CRC-32 of its JSON in hex, a space, and the JSON, a Line. Lines are only ever appended.
 """
 
 from __future__ import annotations
 
-import json
+import logging
 import os
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from . import database
 from .faults import naming
 from .files import sync_dir
 
+logger = logging.getLogger(__name__)
+
 ROWS_PER_LINE = 100  # a torn line costs no more than these
-# Visits are written once, when they have ended; later ones wait for an open one, so that ids grow from line to line.
-TABLES = {
-    "sessions": "SELECT * FROM sessions WHERE session_id > ? ORDER BY session_id LIMIT ?",
-    "scenes": "SELECT * FROM scenes WHERE scene_id > ? ORDER BY scene_id LIMIT ?",
-    "visits": """
-        SELECT *, (SELECT json_group_array(scan_id) FROM visit_scans AS vs WHERE vs.visit_id = v.visit_id) AS scan_ids
-        FROM visits AS v
-        WHERE visit_id > ? AND visit_id < coalesce((SELECT min(visit_id) FROM visits WHERE t_out_ns IS NULL), 1 << 62)
-        ORDER BY visit_id LIMIT ?""",
-}
-KEYS = {"sessions": "session_id", "scenes": "scene_id", "visits": "visit_id"}
+TAIL_BYTES = 4_000_000  # hold several lines; without a whole one in them all is noted once more, and does no harm
+Id = Annotated[int, Field(ge=0, lt=1 << 63)]
+Row = dict[str, Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | float | str | None]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+
+class UpTo(_Part):
+    """The highest ids that are in the file."""
+
+    sessions: Id = 0
+    scenes: Id = 0
+    visits: Id = 0
+
+
+class VisitScans(_Part):
+    """Which scans a visit consists of."""
+
+    visit_id: Id
+    scan_ids: list[Id]
+
+
+class Line(_Part):
+    """Rows of the index by column names, in tables of which each refers to those before it."""
+
+    sessions: list[Row]
+    scenes: list[Row]
+    visits: list[Row]
+    visit_scans: list[VisitScans]
+    up_to: UpTo
 
 
 class PlacesLog:
@@ -37,39 +61,85 @@ class PlacesLog:
 
     def __init__(self, path: Path, index: database.Connection):
         self._path, self._index = path, index
-        lines = list(read(path))
-        self._up_to = lines[-1]["up_to"] if lines else dict.fromkeys(TABLES, 0)
+        last = _last_line(path)
+        self._up_to = last.up_to if last else UpTo()
 
     def catch_up(self) -> None:
         """Append what the index holds and the file does not. Raises StorageUnavailable, OSError: then the next
         call does it."""
-        while batch := self._missing():
-            up_to = {**self._up_to, **{table: rows[-1][KEYS[table]] for table, rows in batch.items()}}
+        while (line := self._next_line()).up_to != self._up_to:
             with naming(self._path):
-                _append(self._path, {**batch, "up_to": up_to})
-            self._up_to = up_to
+                _append(self._path, line)
+            self._up_to = line.up_to
 
-    def _missing(self) -> dict[str, list[dict[str, Any]]]:
-        found = {table: self._index.rows(sql, (self._up_to[table], ROWS_PER_LINE)) for table, sql in TABLES.items()}
-        for visit in found["visits"]:
-            visit["scan_ids"] = json.loads(visit["scan_ids"])
-        return {table: rows for table, rows in found.items() if rows}
+    def _next_line(self) -> Line:
+        up_to = self._up_to
+        sessions = self._index.rows(
+            "SELECT * FROM sessions WHERE session_id > ? ORDER BY session_id LIMIT ?", (up_to.sessions, ROWS_PER_LINE)
+        )
+        scenes = self._index.rows(
+            "SELECT * FROM scenes WHERE scene_id > ? ORDER BY scene_id LIMIT ?", (up_to.scenes, ROWS_PER_LINE)
+        )
+        # Once each, when they have ended; later ones wait for an open one, so that ids grow from line to line.
+        visits = self._index.rows(
+            """SELECT * FROM visits WHERE visit_id > ?
+                   AND visit_id < coalesce((SELECT min(visit_id) FROM visits WHERE t_out_ns IS NULL), 1 << 62)
+               ORDER BY visit_id LIMIT ?""",
+            (up_to.visits, ROWS_PER_LINE),
+        )
+        return Line(
+            sessions=sessions,
+            scenes=scenes,
+            visits=visits,
+            visit_scans=[self._visit_scans(visit["visit_id"]) for visit in visits],
+            up_to=UpTo(
+                sessions=sessions[-1]["session_id"] if sessions else up_to.sessions,
+                scenes=scenes[-1]["scene_id"] if scenes else up_to.scenes,
+                visits=visits[-1]["visit_id"] if visits else up_to.visits,
+            ),
+        )
+
+    def _visit_scans(self, visit_id: int) -> VisitScans:
+        rows = self._index.tuples("SELECT scan_id FROM visit_scans WHERE visit_id = ?", (visit_id,))
+        return VisitScans(visit_id=visit_id, scan_ids=[row[0] for row in rows])
 
 
-def read(path: Path) -> Iterator[dict[str, Any]]:
+def read(path: Path) -> Iterator[Line]:
     """The lines that are whole; none where there is no file. A torn or damaged one is passed over."""
     if not path.exists():
         return
     with open(path, "rb") as file:
-        for line in file:
-            checksum, _, text = line.rstrip(b"\n").partition(b" ")
-            if checksum == b"%08x" % zlib.crc32(text):
-                yield json.loads(text)
+        for text in file:
+            line = _whole_line(text)
+            if line is not None:
+                yield line
 
 
-def _append(path: Path, content: dict[str, Any]) -> None:
+def _last_line(path: Path) -> Line | None:
+    """The last whole line, without reading years of them."""
+    if not path.exists():
+        return None
+    with open(path, "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - TAIL_BYTES))
+        texts = file.read().splitlines()
+    return next((line for text in reversed(texts) if (line := _whole_line(text)) is not None), None)
+
+
+def _whole_line(text: bytes) -> Line | None:
+    checksum, _, content = text.rstrip(b"\n").partition(b" ")
+    if checksum != b"%08x" % zlib.crc32(content):
+        return None
+    try:
+        return Line.model_validate_json(content)
+    except ValidationError as error:
+        logger.error("a line of places.jsonl is not laid out as it should be: %d errors", error.error_count())
+        return None
+
+
+def _append(path: Path, line: Line) -> None:
     """One durable line. What a crash left of a line before it is ended first."""
-    text = json.dumps(content, separators=(",", ":")).encode()
+    text = line.model_dump_json().encode()
     is_new = not path.exists()
     with open(path, "ab+", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)

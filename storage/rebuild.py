@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +59,9 @@ def adopt(index: IndexStore, scans: ScanStore, session: int, scan_id: int) -> No
 
 def _add_places(index: IndexStore, path: Path) -> None:
     for line in placeslog.read(path):
-        with index.transaction():
-            for table in ("sessions", "scenes", "visits"):
-                for row in line.get(table, []):
-                    _insert(index, table, {name: value for name, value in row.items() if name != "scan_ids"})
+        for table in ("sessions", "scenes", "visits"):
+            for row in getattr(line, table):
+                _insert(index, table, row)
 
 
 def _add_scans(index: IndexStore, scans: ScanStore) -> tuple[int, int]:
@@ -80,10 +81,13 @@ def _add_scans(index: IndexStore, scans: ScanStore) -> tuple[int, int]:
 
 
 def _add_visit_scans(index: IndexStore, path: Path) -> None:
-    """Those whose scans are still there."""
+    """Those whose visits and scans are there."""
     for line in placeslog.read(path):
-        pairs = [(visit["visit_id"], scan_id) for visit in line.get("visits", []) for scan_id in visit["scan_ids"]]
-        index.db.write_many("INSERT OR IGNORE INTO visit_scans SELECT ?, scan_id FROM scans WHERE scan_id = ?", pairs)
+        index.db.write_many(
+            """INSERT OR IGNORE INTO visit_scans
+               SELECT visit_id, scan_id FROM visits CROSS JOIN scans WHERE visit_id = ? AND scan_id = ?""",
+            [(visit.visit_id, scan_id) for visit in line.visit_scans for scan_id in visit.scan_ids],
+        )
 
 
 def _end_sessions(index: IndexStore) -> None:
@@ -112,11 +116,16 @@ def _unknown_session(scan: Scan) -> dict[str, Any]:
     }
 
 
-def _insert(index: IndexStore, table: str, row: dict[str, Any]) -> None:
-    """Insert a row that may be there already."""
+def _insert(index: IndexStore, table: str, row: Mapping[str, Any]) -> None:
+    """Insert a row that may be there already. One that the schema refuses, as none was ever written, is left out."""
+    columns = {name for (name,) in index.db.tuples("SELECT name FROM pragma_table_info(?)", (table,))}
+    row = {name: value for name, value in row.items() if name in columns}
     marks = ", ".join("?" * len(row))
     sql = f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks}) ON CONFLICT DO NOTHING"
-    index.db.write(sql, tuple(row.values()))
+    try:
+        index.db.write(sql, tuple(row.values()))
+    except sqlite3.IntegrityError as error:
+        logger.error("not in the rebuilt index: a row of %s: %s", table, error)
 
 
 def _remove(path: Path) -> None:

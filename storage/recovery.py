@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import TypeVar
 
 from . import database
 from .backup import backups, check_whole
@@ -20,6 +22,8 @@ from .files import replace_durably, sync_dir
 from .index import IndexStore
 from .rebuild import rebuild_index
 from .scans import ScanStore
+
+Opened = TypeVar("Opened", IndexStore, ChangeStore)
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +36,7 @@ def open_index(data_dir: DataDir, scans: ScanStore, repairs: list[str]) -> Index
     path = data_dir.index_path
     try:
         if database.version(path) or not (data_dir.places_path.exists() or scans.highest_id()):
-            return IndexStore.open_writer(path, data_dir.uuid)
+            return _sound(path, lambda: IndexStore.open_writer(path, data_dir.uuid))
         fault = f"{path} was lost"
     except DatabaseCorrupt as error:
         logger.error("%s", error)
@@ -50,7 +54,7 @@ def open_changes(data_dir: DataDir, repairs: list[str]) -> ChangeStore:
     path = data_dir.changes_path
     try:
         if database.version(path) or not backups(data_dir):
-            return ChangeStore.open_writer(path, data_dir.uuid)
+            return _sound(path, lambda: ChangeStore.open_writer(path, data_dir.uuid))
         fault = f"{path} was lost"
     except DatabaseCorrupt as error:
         logger.error("%s", error)
@@ -61,6 +65,22 @@ def open_changes(data_dir: DataDir, repairs: list[str]) -> ChangeStore:
     store.skip_used_numbers()
     came = f"restored from {restored.name}: changes since then are lost" if restored else "no good backup: all are lost"
     _note(repairs, f"{fault}; {kept}{came}")
+    return store
+
+
+def _sound(path: Path, open_writer: Callable[[], Opened]) -> Opened:
+    """An opened database; where damage was met in use, only after every row was read. Raises DatabaseCorrupt.
+
+    SQLite has no checksums: damage within a row is not noticed by its checks.
+    """
+    doubted = database.suspicion(path).exists()
+    store = open_writer()
+    if doubted:
+        try:
+            store.read_through()
+        except BaseException:
+            store.close()
+            raise
     return store
 
 

@@ -7,8 +7,10 @@ row is deleted; the next start finishes what is left. What the index does not kn
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,13 +134,14 @@ def finish_garbage(index: database.Connection, scans: ScanStore) -> int:
 
 def used_bytes(directory: Path, index: database.Connection) -> int:
     """What a data directory takes on disk: the scan files by the index, all else by its size, in whole blocks."""
-    return index.value("SELECT scan_bytes FROM usage") + sum(
-        blocks_bytes(entry.stat().st_size)
-        for folder in (directory, directory / "sensors", directory / "backups")
-        if folder.is_dir()
-        for entry in folder.iterdir()
-        if entry.is_file()
-    )
+    used = index.value("SELECT scan_bytes FROM usage")
+    for folder, subfolders, names in os.walk(directory):
+        if folder == str(directory):
+            subfolders.remove("scans")
+        for name in names:
+            with suppress(FileNotFoundError):  # a WAL may go in this moment
+                used += blocks_bytes(os.stat(os.path.join(folder, name)).st_size)
+    return used
 
 
 def blocks_bytes(size: int) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from typing import Self
@@ -102,3 +103,27 @@ class SceneScans(Trajectory):
     visit_number: np.ndarray  # (N,) int64
     descriptors: np.ndarray  # (N, D) float32, unit
     model_id: np.ndarray  # (N,) str, of the descriptors
+
+
+POSE = "s.scan_id, s.session_id, s.stamp_ns, s.aligned, s.x, s.y, s.z, s.qx, s.qy, s.qz, s.qw"  # of scans AS s
+
+
+def trajectory_columns(rows: list[tuple]) -> dict[str, np.ndarray]:
+    """Rows that begin with POSE -> the columns of a Trajectory."""
+    poses = np.array([row[4:11] for row in rows], np.float64).reshape(-1, 7)
+    T_map_sensor = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rows:
+        T_map_sensor[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
+        T_map_sensor[:, :3, 3] = poses[:, :3]
+    return {
+        "scan_id": np.array([row[0] for row in rows], np.int64),
+        "session": np.array([row[1] for row in rows], np.int64),
+        "stamp_ns": np.array([row[2] for row in rows], np.int64),
+        "aligned": np.array([row[3] for row in rows], bool),
+        "T_map_sensor": T_map_sensor,
+    }
+
+
+def descriptor_array(blobs: list[bytes]) -> np.ndarray:
+    """Equal-length blobs of float32 -> (N, D) float32."""
+    return np.frombuffer(b"".join(blobs), "<f4").reshape(len(blobs), -1 if blobs else 0).astype(np.float32)

@@ -22,10 +22,11 @@ import math
 import struct
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import zstandard
+from pydantic import BaseModel, ConfigDict, Field
 
 from .errors import ScanFileError
 
@@ -38,7 +39,31 @@ ZSTD_LEVEL = 3
 PREFIX = struct.Struct("<8sHIII")
 ARRAYS = ("range_mm", "reflectivity", "column_ns", "column_valid", "descriptor")
 POSES = ("T_map_sensor", "T_odom_sensor", "T_start_end")
-HINT = "delete it; the other scans are not concerned"
+HINT = "`revisitd fsck --repair` puts it aside; the other scans are not concerned"
+Int64 = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
+Side = Annotated[int, Field(ge=1, le=1 << 14)]  # of an image, pixels
+Pose = Annotated[list[float], Field(min_length=16, max_length=16)]
+
+
+class _Header(BaseModel):
+    """The JSON in front, each value of the type and within the limits of what is written."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    scan_id: Int64
+    session: Int64
+    stamp_ns: Int64
+    host_ns: Int64
+    frame_id: Int64
+    sensor_digest: str
+    model_id: str
+    aligned: bool
+    alignment_residual_m: float | None
+    T_map_sensor: Pose
+    T_odom_sensor: Pose
+    T_start_end: Pose
+    shape: tuple[Side, Side]
+    parts: list[tuple[str, Int64]]
 
 
 def encode(scan: Scan) -> bytes:
@@ -72,31 +97,34 @@ def decode(data: bytes, path: Path, images: bool = True) -> dict[str, Any]:
     """
     head, body = _checked(data, path)
     try:
-        fields = json.loads(head)
+        fields = dict(_Header.model_validate_json(head))
         height, width = fields.pop("shape")
         parts, start = {}, 0
         for name, length in fields.pop("parts"):
             parts[name] = body[start : start + length]
             start += length
         for name in POSES:
-            fields[name] = np.array(fields[name], np.float64).reshape(4, 4)
+            fields[name] = np.array(fields[name]).reshape(4, 4)
         if fields["alignment_residual_m"] is None:
             fields["alignment_residual_m"] = math.nan
         fields.update(_arrays(parts, height, width, images))
-    except (KeyError, ValueError, TypeError, zstandard.ZstdError) as error:
+    except (KeyError, ValueError, zstandard.ZstdError) as error:
         # The checksum held, so the disk is not to blame: whoever wrote the file did something else.
-        raise ScanFileError(f"{path}: not laid out as version {VERSION} has it ({error}); {HINT}") from error
+        why = " ".join(str(error).split())  # pydantic's come in several lines
+        raise ScanFileError(f"{path}: not laid out as version {VERSION} has it ({why}); {HINT}") from error
     return fields
 
 
 def _arrays(parts: dict[str, memoryview], height: int, width: int, images: bool) -> dict[str, np.ndarray | None]:
     """The arrays of a Scan from the parts of the body."""
-    steps = _from_byte_planes(_decompress(parts["column_ns"]), (width,), np.dtype("<u8"))
-    valid_bits = np.frombuffer(parts["column_valid"], np.uint8)
+    steps = _from_byte_planes(_decompress(parts["column_ns"], 8 * width), (width,), np.dtype("<u8"))
+    valid_bits = np.frombuffer(parts["column_valid"], np.uint8, -(-width // 8))
     range_mm = reflectivity = None
     if images:
-        range_mm = _from_byte_planes(_decompress(parts["range_mm"]), (height, width), np.dtype("<u4"))
-        reflectivity = np.frombuffer(_decompress(parts["reflectivity"]), np.uint8).reshape(height, width)
+        planes = _decompress(parts["range_mm"], 4 * height * width)
+        range_mm = _from_byte_planes(planes, (height, width), np.dtype("<u4"))
+        reflectivity = np.frombuffer(_decompress(parts["reflectivity"], height * width), np.uint8)
+        reflectivity = reflectivity.reshape(height, width)
     return {
         "range_mm": range_mm,
         "reflectivity": reflectivity,
@@ -131,7 +159,11 @@ def _compress(array: np.ndarray) -> bytes:
     return zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(array)
 
 
-def _decompress(data: memoryview) -> bytes:
+def _decompress(data: memoryview, most_bytes: int) -> bytes:
+    """Raises ValueError where it would become larger: a damaged length must not take all memory."""
+    size = zstandard.frame_content_size(data)
+    if not 0 <= size <= most_bytes:
+        raise ValueError(f"a part of {size} bytes where {most_bytes} are the most")
     return zstandard.ZstdDecompressor().decompress(data)
 
 
@@ -145,7 +177,7 @@ def _byte_planes(words: np.ndarray) -> np.ndarray:
 
 def _from_byte_planes(data: bytes, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """The reverse of _byte_planes: words of this shape and dtype."""
-    planes = np.frombuffer(data, np.uint8).reshape(-1, *shape)
+    planes = np.frombuffer(data, np.uint8).reshape(-1, *shape)  # an error where they are not whole
     words = np.zeros(shape, dtype)
     bytes_last = words.view(np.uint8).reshape(*shape, dtype.itemsize)
     for i, plane in enumerate(planes):

@@ -86,6 +86,8 @@ class ScanStore:
             data = path.read_bytes()
         except FileNotFoundError:
             raise ScanFileError(f"{path}: no such scan file: deleted by the retention, or by hand") from None
+        except OSError as error:
+            raise ScanFileError(f"{path}: cannot be read: {error.strerror}") from error
         scan = Scan(**scanfile.decode(data, path, images))
         if (scan.session, scan.scan_id) != (session, scan_id):
             raise ScanFileError(f"{path}: holds scan {scan.scan_id} of session {scan.session}: move it back")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from revisitd.storage.changes import Change
+from revisitd.storage.changerows import Change
 from revisitd.storage.scans import Scan
 
 SESSION = {

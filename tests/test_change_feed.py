@@ -13,7 +13,8 @@ from click.testing import CliRunner
 from stored import make_change
 
 from revisitd.daemon.cli import cli
-from revisitd.storage.changes import ChangeStore, MergedChange, Observation
+from revisitd.storage.changerows import MergedChange, Observation
+from revisitd.storage.changes import ChangeStore
 from revisitd.storage.schema import CHANGES_V1, CHANGES_V2
 from revisitd.storage.store import Store
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from stored import make_change
 
-from revisitd.storage.changes import ChangeStore, Observation
+from revisitd.storage.changerows import Observation
+from revisitd.storage.changes import ChangeStore
 from revisitd.storage.errors import StorageError
 from revisitd.storage.schema import CHANGES_MIGRATIONS
 

@@ -77,7 +77,7 @@ HARMS = {
     ),
     "a known file is damaged": (
         lambda data: spoil(path_of(data, 3)),
-        "3.scan: damaged: its checksum does not match; delete it; the other scans are not concerned: moved to damaged/",
+        "3.scan: damaged: its checksum does not match",
     ),
     "an unknown file is damaged": (
         lambda data: (index(data, "DELETE FROM scans WHERE scan_id = 3"), spoil(path_of(data, 3))),

@@ -159,6 +159,20 @@ def test_damage_that_is_met_in_use_is_mended_at_the_next_start(data, monkeypatch
     assert not (data / "index.db.suspect").exists()
 
 
+def test_damage_within_a_row_is_met_in_use_and_mended_at_the_next_start(data):
+    with Store.open_writer(data) as store:
+        back_up_if_due(store.dir, 0.0, kept=1)
+    path = data / "changes.db"
+    path.write_bytes(path.read_bytes().replace(b'{"n_scans_confirming"', b'{"n_scans\xffconfirming"'))
+    with Store.open_writer(data) as store:  # SQLite finds nothing wrong with it
+        assert store.repairs == []
+        with pytest.raises(DatabaseCorrupt, match="changes.db: damaged"):
+            store.changes.changes()
+    with Store.open_writer(data) as store:
+        assert "restored from changes-" in store.repairs[0]
+        assert len(store.changes.changes()) == 1
+
+
 @pytest.mark.parametrize("harm", [damage, lambda path: damage(path, 0), delete, empty], ids=str)
 def test_lost_changes_come_back_from_the_newest_good_backup(data, harm):
     with Store.open_writer(data) as store:

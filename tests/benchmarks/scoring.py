@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from revisitd.drivers.virtual import Capture, simulate
-from revisitd.storage.changes import ChangeObject, one_per_voxel
+from revisitd.storage.changerows import ChangeObject, one_per_voxel
 from revisitd.storage.store import Store
 
 MATCH_M = 1.0  # CDSD section V-A: a change of the same polarity within 1 m of the true one
