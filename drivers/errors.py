@@ -27,3 +27,7 @@ class SensorRefused(SensorUnavailable):
 
 class SensorChanged(SensorUnavailable):
     """The sensor is not any more as it was when it was opened: open it again."""
+
+
+class SensorTaken(SensorChanged):
+    """Another client has set the sensor to send elsewhere, or otherwise."""

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
     """Everything the program needs of one sensor's metadata: H beams, W columns (measurement ids) a turn."""
 
@@ -64,7 +64,7 @@ class Sensor:
         return np.arange(height)[:, None], column
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Frame:
     """One rotation, staggered: column i holds what was measured at measurement id i."""
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-from .errors import DriverError, SensorChanged, SensorUnavailable
+from .errors import DriverError, SensorChanged, SensorTaken, SensorUnavailable
 from .faults import FaultWatch
 from .frame import Frame, Sensor
 from .live import LiveSource
@@ -71,6 +71,7 @@ class KeptSource:
         self._first_delay_s, self._longest_delay_s, self._silence_s = first_delay_s, longest_delay_s, silence_s
         self.losses: Counter = Counter()  # Loss -> how often, over all openings
         self.state = SensorState(Phase.CONNECTING, "", time.time_ns(), 0, None)
+        self._first_frame_s: float | None = None  # since it was last opened, host's monotonic clock
         self._telemetry = TelemetryPoller(SensorHttp(address), self._is_open, stop)
 
     @property
@@ -81,14 +82,16 @@ class KeptSource:
     def __iter__(self) -> Iterator[Frame | None]:
         delay_s = self._first_delay_s
         while not self._stop.is_set():
-            opened_s = time.monotonic()
+            self._first_frame_s = None
             try:
                 with (yield from self._open()) as live:
                     yield from self._read(live)
             except DriverError as error:
+                if self._stop.is_set():
+                    return
                 self._tell(Phase.WAITING, str(error))
-            if time.monotonic() - opened_s > self._longest_delay_s:  # it ran well in between
-                delay_s = self._first_delay_s
+                if self._ran_well(error):
+                    delay_s = self._first_delay_s
             yield from self._wait(delay_s)
             delay_s = min(2 * delay_s, self._longest_delay_s)
 
@@ -116,6 +119,7 @@ class KeptSource:
         heard_s = time.monotonic()
         for frame in live.listen():
             if frame is not None:
+                self._first_frame_s = self._first_frame_s or time.monotonic()
                 if self.state.phase is not Phase.RUNNING:
                     inquiry = self._inquiry(live)
                 if not live.has_ids:
@@ -126,6 +130,15 @@ class KeptSource:
             yield frame
             if frame is not None:
                 heard_s = time.monotonic()  # only now: a reader may take long for a frame
+
+    def _ran_well(self, end: DriverError) -> bool:
+        """Whether the sensor gave frames until this end; for long enough, where another client took it.
+
+        Two clients that take the stream from each other at once would keep it from both.
+        """
+        if self._first_frame_s is None:
+            return False
+        return not isinstance(end, SensorTaken) or time.monotonic() - self._first_frame_s > self._longest_delay_s
 
     def _inquiry(self, live: LiveSource) -> "_Inquiry":
         sensor, init_id = SensorHttp(self._address), live.sensor.init_id

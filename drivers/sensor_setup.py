@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from ipaddress import ip_address
 
-from .errors import SensorChanged, SensorRefused, SensorUnavailable
+from .errors import SensorChanged, SensorRefused, SensorTaken, SensorUnavailable
 from .sensor_http import SensorHttp
 
 logger = logging.getLogger(__name__)
@@ -71,14 +71,15 @@ def prepare_sensor(sensor: SensorHttp, wish: SensorWish, our_address: str, stop:
 def require_unchanged(sensor: SensorHttp, wish: SensorWish, our_address: str, init_id: int) -> None:
     """Asks a sensor that was prepared whether it still is.
 
-    Raises SensorChanged with what is different, SensorUnavailable where it does not answer.
+    Raises SensorTaken or SensorChanged with what is different, SensorUnavailable where it does not answer.
     """
     metadata = sensor.metadata()
     config, info = metadata["config_params"], metadata["sensor_info"]
     changed = _differing(config, wish.wanted(our_address))
     if changed:
         now = _listed({name: config.get(name) for name in changed})
-        raise SensorChanged(
+        error = SensorTaken if config.get("udp_dest") else SensorChanged  # after a restart it sends to nobody
+        raise error(
             f"sensor {sensor.address} now has {now}, not {_listed(changed)}: another client took its stream, "
             "or it was restarted"
         )

@@ -8,12 +8,19 @@ from captures import metadata, packets, ranges_mm
 from fake_sensor import fake_sensor, free_port
 from follower import Follower
 
-from revisitd.drivers.kept import Phase
+from revisitd.drivers import sensor_setup
+from revisitd.drivers.kept import KeptSource, Phase
 from revisitd.drivers.sensor_setup import SensorWish
 
 
+@pytest.fixture(autouse=True)
+def impatience(monkeypatch):
+    """The fake sensor tells its new state at once, unlike a real one."""
+    monkeypatch.setattr(sensor_setup, "POLL_S", 0.02)
+
+
 @pytest.fixture
-def follow():
+def follow(caplog):
     followers = []
 
     def begin(address: str, **wish) -> Follower:
@@ -21,8 +28,10 @@ def follow():
         return followers[-1]
 
     yield begin
+    caplog.clear()
     for follower in followers:
         follower.close()
+    assert not caplog.records, "to be stopped is no problem"
 
 
 def test_a_sensor_that_is_absent_at_first_is_waited_for(follow):
@@ -68,6 +77,29 @@ def test_a_stream_that_another_client_took_is_named_and_taken_back(follow):
         assert "another client took its stream" in state.problem
         follower.until_opened(2)
         assert fake.document["config_params"]["udp_dest"] == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    "section, name, values, delays",
+    [
+        ("config_params", "udp_dest", ["10.5.5.77"] * 3, [0.05, 0.1, 0.2]),  # two clients must not fight each second
+        ("sensor_info", "initialization_id", [1, 2, 3], [0.05, 0.05, 0.05]),
+    ],
+)
+def test_what_another_client_takes_is_taken_back_less_and_less_often_and_all_else_at_once(
+    follow, monkeypatch, section, name, values, delays
+):
+    waited = []
+    monkeypatch.setattr(KeptSource, "_wait", lambda _self, delay_s: waited.append(delay_s) or iter([None]))
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        for times, value in enumerate(values, 1):
+            follower.until_opened(times)
+            fake.send(packets(fake.document, range(1)))
+            follower.until_running()
+            fake.document[section][name] = value
+            follower.until(lambda _, times=times: len(waited) == times)
+    assert waited == delays
 
 
 def test_a_silent_sensor_is_listened_to_and_goes_on_without_being_opened_again(follow):
