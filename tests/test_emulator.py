@@ -178,6 +178,16 @@ def test_what_is_wished_is_set_again_when_someone_else_changes_it(sensor, follow
     assert follower.more_frames(2)[-1].sensor.profile == "RNG15_RFL8_NIR8"
 
 
+@pytest.mark.parametrize(
+    "azimuth_window, columns",
+    [([180_000, 360_000], [1, 256]), ([300_000, 100_000], [370, 85]), ([0, 360_000], [0, 511])],
+)
+def test_azimuth_windows_are_the_columns_that_real_sensors_tell(sensor, azimuth_window, columns):
+    """As in the metadata of ouster-sdk's windowed captures, of sensors at 512x10."""
+    sensor.configure(azimuth_window=azimuth_window)
+    assert sensor.get("sensor/metadata/lidar_data_format")["column_window"] == columns
+
+
 def test_a_stolen_stream_is_named_and_taken_back(sensor, follow):
     follower = follow(sensor.address)
     follower.more_frames(1)
