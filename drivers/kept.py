@@ -14,7 +14,7 @@ from .errors import DriverError, SensorChanged, SensorTaken, SensorUnavailable
 from .faults import FaultWatch
 from .frame import Frame, Sensor
 from .live import LiveSource
-from .sensor_http import SensorHttp
+from .sensor_http import SensorHttp, resolve
 from .sensor_setup import SensorWish, require_unchanged
 from .telemetry import Telemetry, TelemetryPoller
 
@@ -141,14 +141,20 @@ class KeptSource:
         return not isinstance(end, SensorTaken) or time.monotonic() - self._first_frame_s > self._longest_delay_s
 
     def _inquiry(self, live: LiveSource) -> "_Inquiry":
-        sensor, init_id = SensorHttp(self._address), live.sensor.init_id
+        our_address = live.route[1]
         return _Inquiry(
-            lambda: require_unchanged(sensor, self._wish, live.our_address, init_id),
-            f"sensor {self._address} sends nothing to UDP port {live.port} of {live.our_address}, as far as it gets "
-            "here: check cable and firewall",
+            lambda: self._require_as_opened(live.route, live.sensor.init_id),
+            f"sensor {self._address} sends nothing to UDP port {live.port} of {our_address}, as far as it gets here: "
+            "check cable and firewall",
             self._first_delay_s,
             self._longest_delay_s,
         )
+
+    def _require_as_opened(self, route: tuple[str, str], init_id: int) -> None:
+        """Raises SensorChanged where the sensor must be opened again, SensorUnavailable where it does not answer."""
+        if resolve(self._address) != route:
+            raise SensorChanged(f"sensor {self._address}, or this machine, has another IP address now")
+        require_unchanged(SensorHttp(self._address), self._wish, route[1], init_id)
 
     def _is_open(self) -> bool:
         return self.state.phase in (Phase.RUNNING, Phase.SILENT)

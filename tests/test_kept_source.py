@@ -8,7 +8,7 @@ from captures import metadata, packets, ranges_mm
 from fake_sensor import fake_sensor, free_port
 from follower import Follower
 
-from revisitd.drivers import sensor_setup
+from revisitd.drivers import kept, sensor_setup
 from revisitd.drivers.kept import KeptSource, Phase
 from revisitd.drivers.sensor_setup import SensorWish
 
@@ -122,6 +122,15 @@ def test_a_reader_that_is_slow_is_not_taken_for_a_silent_sensor(follow, caplog):
             time.sleep(0.3)  # silence is 0.25 s
         follower.more_frames(1)
     assert not caplog.records
+
+
+def test_a_sensor_with_a_new_ip_address_is_opened_again(follow, monkeypatch):
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        monkeypatch.setattr(kept, "resolve", lambda _address: ("10.5.5.9", "10.5.5.1"))
+        follower.until_problem("has another IP address now")
+        follower.until_opened(2)
 
 
 def test_a_port_that_is_taken_is_named_and_tried_again(follow):
