@@ -101,7 +101,7 @@ def resolve(address: str) -> tuple[str, str]:
             return target[0], probe.getsockname()[0]
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "not a name"
-        raise SensorUnavailable(f"there is no file and no sensor {host} ({reason})") from None
+        raise SensorUnavailable(f"there is no sensor {host} ({reason}): check its name, and the network") from None
 
 
 def host_of(address: str) -> str:

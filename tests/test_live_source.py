@@ -167,7 +167,7 @@ def test_a_web_server_that_is_no_sensor_is_an_error():
 
 
 def test_a_name_that_is_neither_file_nor_sensor_is_an_error():
-    with pytest.raises(SensorUnavailable, match="no file and no sensor nowhere.invalid"):
+    with pytest.raises(SensorUnavailable, match="there is no sensor nowhere.invalid .*check its name"):
         open_source("nowhere.invalid")
 
 
