@@ -4,6 +4,7 @@ import json
 import socket
 import threading
 import time
+from contextlib import suppress
 from itertools import islice
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from captures import COLUMNS, INIT_ID, packets, ranges_mm
 from fake_sensor import METADATA, fake_sensor
 
-from revisitd.drivers import live
+from revisitd.drivers import live, sensor_http
 from revisitd.drivers.errors import BadMetadata, SensorUnavailable
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.ouster import open_source
@@ -154,6 +155,25 @@ def test_a_machine_without_a_sensor_is_an_error():
         address = f"127.0.0.1:{listener.getsockname()[1]}"
     with pytest.raises(SensorUnavailable, match="no sensor answers at http://127.0.0.1.*refused"):
         open_source(address)
+
+
+def test_an_answer_that_comes_in_drops_without_end_is_given_up(monkeypatch):
+    monkeypatch.setattr(sensor_http, "ANSWER_TIMEOUT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def drip() -> None:
+            connection, _ = server.accept()
+            with connection, suppress(OSError):
+                connection.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+                while True:
+                    connection.sendall(b" ")
+                    time.sleep(0.01)
+
+        dripping = threading.Thread(target=drip)
+        dripping.start()
+        with pytest.raises(SensorUnavailable, match="its answer does not end"):
+            open_source(f"127.0.0.1:{server.getsockname()[1]}")
+        dripping.join()
 
 
 def test_a_web_server_that_is_no_sensor_is_an_error():
