@@ -191,6 +191,13 @@ def test_a_name_that_is_neither_file_nor_sensor_is_an_error():
         open_source("nowhere.invalid")
 
 
+@pytest.mark.parametrize("address", ["127.0.0.1:99999", "a b", "[::1", "os1:x", "x" * 300, "os\0", ".", "-"])
+def test_an_address_that_cannot_be_one_is_an_error(address):
+    with pytest.raises(SensorUnavailable) as caught:
+        live.LiveSource(address)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_sensor_with_its_lidar_off_is_an_error():
     with fake_sensor("OFF") as fake, pytest.raises(BadMetadata, match="switched off"):
         open_source(fake.address)
