@@ -20,7 +20,7 @@ class Rejection(str, Enum):
 
     TOO_FEW_COLUMNS = "too few columns"
     TIME_DAMAGED = "column times damaged"
-    TIME_DOUBTFUL = "time beside the frames before"
+    TIME_DOUBTFUL = "time out of step"
     TIME_NOT_INCREASING = "time not increasing"
     NO_RETURNS = "no returns"
 

@@ -14,7 +14,7 @@ from .errors import DriverError, SensorChanged, SensorTaken, SensorUnavailable
 from .faults import FaultWatch
 from .frame import Frame, Sensor
 from .live import LiveSource
-from .sensor_http import SensorHttp
+from .sensor_http import SensorHttp, resolve
 from .sensor_setup import SensorWish, require_unchanged
 from .telemetry import Telemetry, TelemetryPoller
 
@@ -71,6 +71,7 @@ class KeptSource:
         self._first_delay_s, self._longest_delay_s, self._silence_s = first_delay_s, longest_delay_s, silence_s
         self.losses: Counter = Counter()  # Loss -> how often, over all openings
         self.state = SensorState(Phase.CONNECTING, "", time.time_ns(), 0, None)
+        self._first_frame_s: float | None = None  # since it was last opened, host's monotonic clock
         self._telemetry = TelemetryPoller(SensorHttp(address), self._is_open, stop)
 
     @property
@@ -81,16 +82,16 @@ class KeptSource:
     def __iter__(self) -> Iterator[Frame | None]:
         delay_s = self._first_delay_s
         while not self._stop.is_set():
-            opened_s, well = time.monotonic(), False
+            self._first_frame_s = None
             try:
                 with (yield from self._open()) as live:
                     yield from self._read(live)
             except DriverError as error:
-                # Two clients that take the stream from each other at once would keep it from both.
-                patient = isinstance(error, SensorTaken) and time.monotonic() - opened_s < self._longest_delay_s
-                well = self.state.phase in (Phase.RUNNING, Phase.SILENT) and not patient
+                if self._stop.is_set():
+                    return
                 self._tell(Phase.WAITING, str(error))
-            delay_s = self._first_delay_s if well else delay_s
+                if self._ran_well(error):
+                    delay_s = self._first_delay_s
             yield from self._wait(delay_s)
             delay_s = min(2 * delay_s, self._longest_delay_s)
 
@@ -118,6 +119,7 @@ class KeptSource:
         heard_s = time.monotonic()
         for frame in live.listen():
             if frame is not None:
+                self._first_frame_s = self._first_frame_s or time.monotonic()
                 if self.state.phase is not Phase.RUNNING:
                     inquiry = self._inquiry(live)
                 if not live.has_ids:
@@ -129,15 +131,30 @@ class KeptSource:
             if frame is not None:
                 heard_s = time.monotonic()  # only now: a reader may take long for a frame
 
+    def _ran_well(self, end: DriverError) -> bool:
+        """Whether the sensor gave frames until this end; for long enough, where another client took it.
+
+        Two clients that take the stream from each other at once would keep it from both.
+        """
+        if self._first_frame_s is None:
+            return False
+        return not isinstance(end, SensorTaken) or time.monotonic() - self._first_frame_s > self._longest_delay_s
+
     def _inquiry(self, live: LiveSource) -> "_Inquiry":
-        sensor, init_id = SensorHttp(self._address), live.sensor.init_id
+        our_address = live.route[1]
         return _Inquiry(
-            lambda: require_unchanged(sensor, self._wish, live.our_address, init_id),
-            f"sensor {self._address} sends nothing to UDP port {live.port} of {live.our_address}, as far as it gets "
-            "here: check cable and firewall",
+            lambda: self._require_as_opened(live.route, live.sensor.init_id),
+            f"sensor {self._address} sends nothing to UDP port {live.port} of {our_address}, as far as it gets here: "
+            "check cable and firewall",
             self._first_delay_s,
             self._longest_delay_s,
         )
+
+    def _require_as_opened(self, route: tuple[str, str], init_id: int) -> None:
+        """Raises SensorChanged where the sensor must be opened again, SensorUnavailable where it does not answer."""
+        if resolve(self._address) != route:
+            raise SensorChanged(f"sensor {self._address}, or this machine, has another IP address now")
+        require_unchanged(SensorHttp(self._address), self._wish, route[1], init_id)
 
     def _is_open(self) -> bool:
         return self.state.phase in (Phase.RUNNING, Phase.SILENT)

@@ -57,11 +57,12 @@ class LiveSource(Source):
         self._stop = stop or threading.Event()
         self._timeout_s = timeout_s
         self.losses: Counter = Counter() if losses is None else losses
-        sensor_ip, self.our_address = resolve(address)
+        self.route = resolve(address)
+        sensor_ip, our_address = self.route
         if meta:
             text = read_metadata(meta).text
         else:
-            text = json.dumps(prepare_sensor(SensorHttp(address), wish, self.our_address, self._stop))
+            text = json.dumps(prepare_sensor(SensorHttp(address), wish, our_address, self._stop))
         self._info = parse_metadata(text)
         self.sensor = sensor_from_info(self._info, text)
         self._filter = PacketFilter(self._info)

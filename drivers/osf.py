@@ -110,10 +110,13 @@ def _fault(path: Path) -> str | None:
         header, fault = _block(file)
         if fault:
             return f"its header {fault}"
-        table = struct.unpack_from("<I", header)[0]
-        vtable = table - struct.unpack_from("<i", header, table)[0]
-        field_at = struct.unpack_from("<H", header, vtable + METADATA_OFFSET_ENTRY)[0]
-        offset = struct.unpack_from("<Q", header, table + field_at)[0]
+        try:
+            table = struct.unpack_from("<I", header)[0]
+            vtable = table - struct.unpack_from("<i", header, table)[0]
+            field_at = struct.unpack_from("<H", header, vtable + METADATA_OFFSET_ENTRY)[0]
+            offset = struct.unpack_from("<Q", header, table + field_at)[0]
+        except struct.error:
+            return "its header is not that of an OSF file"
         if offset >= path.stat().st_size:
             return _chunk_fault(file)
         file.seek(offset)

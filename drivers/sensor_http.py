@@ -72,7 +72,7 @@ class SensorHttp:
             request = Request(url, data=body, headers={"Content-Type": "application/json"})
             with self._opener.open(request, timeout=REQUEST_TIMEOUT_S) as response:
                 return response.status, _read(response)
-        except (OSError, HTTPException, ValueError) as error:
+        except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last: of a port number
             reason = getattr(error, "reason", error)
             raise SensorUnavailable(
                 f"no sensor answers at http://{self.address} ({reason}): check its power, cable and address"
@@ -99,9 +99,9 @@ def resolve(address: str) -> tuple[str, str]:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect(target)  # sends nothing
             return target[0], probe.getsockname()[0]
-    except (OSError, UnicodeError) as error:
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not a name"
-        raise SensorUnavailable(f"there is no file and no sensor {host} ({reason})") from None
+        raise SensorUnavailable(f"there is no sensor {host} ({reason}): check its name, and the network") from None
 
 
 def host_of(address: str) -> str:

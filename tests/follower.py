@@ -16,7 +16,7 @@ class Follower:
 
     def __init__(self, address: str, wish: SensorWish):
         self.stop = threading.Event()
-        self.source = KeptSource(address, wish, self.stop, first_delay_s=0.05, longest_delay_s=0.4, silence_s=0.25)
+        self.source = KeptSource(address, wish, self.stop, first_delay_s=0.05, longest_delay_s=2.0, silence_s=0.25)
         self.frames: list[Frame] = []
         self._frames = iter(self.source)
 

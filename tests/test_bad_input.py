@@ -2,6 +2,7 @@
 
 import json
 import struct
+import zlib
 from pathlib import Path
 
 import pytest
@@ -216,7 +217,19 @@ def test_metadata_that_is_none_is_refused(text):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", bytes(200), b"\x34\0\0\0" + bytes(60)])
+WILD_HEADER = b"\x34\0\0\0" + b"\xff" * 52  # it points beyond itself, though its checksum is right
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"hello",
+        bytes(200),
+        b"\x34\0\0\0" + bytes(60),
+        WILD_HEADER + zlib.crc32(WILD_HEADER).to_bytes(4, "little"),
+    ],
+)
 def test_a_broken_osf_file_is_an_error(tmp_path, content):
     path = tmp_path / "walk.osf"
     path.write_bytes(content)

@@ -23,7 +23,7 @@ SEEDS = range(60)
         ("pcap", {"ok", "BadCapture"}),
         ("metadata", {"ok", "BadMetadata"}),
         ("osf", {"ok", "BadCapture"}),
-        ("http", {"SensorChanged", "SensorUnavailable"}),
+        ("http", {"SensorTaken", "SensorUnavailable"}),
     ],
 )
 def test_damaged_input_is_an_error_that_says_so_or_is_read(what, outcomes):

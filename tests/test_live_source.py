@@ -4,6 +4,7 @@ import json
 import socket
 import threading
 import time
+from contextlib import suppress
 from itertools import islice
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from captures import COLUMNS, INIT_ID, packets, ranges_mm
 from fake_sensor import METADATA, fake_sensor
 
-from revisitd.drivers import live
+from revisitd.drivers import live, sensor_http
 from revisitd.drivers.errors import BadMetadata, SensorUnavailable
 from revisitd.drivers.losses import Loss
 from revisitd.drivers.ouster import open_source
@@ -156,6 +157,25 @@ def test_a_machine_without_a_sensor_is_an_error():
         open_source(address)
 
 
+def test_an_answer_that_comes_in_drops_without_end_is_given_up(monkeypatch):
+    monkeypatch.setattr(sensor_http, "ANSWER_TIMEOUT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def drip() -> None:
+            connection, _ = server.accept()
+            with connection, suppress(OSError):
+                connection.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+                while True:
+                    connection.sendall(b" ")
+                    time.sleep(0.01)
+
+        dripping = threading.Thread(target=drip)
+        dripping.start()
+        with pytest.raises(SensorUnavailable, match="its answer does not end"):
+            open_source(f"127.0.0.1:{server.getsockname()[1]}")
+        dripping.join()
+
+
 def test_a_web_server_that_is_no_sensor_is_an_error():
     with fake_sensor() as fake:
         fake.document = {"hello": "world"}
@@ -167,8 +187,15 @@ def test_a_web_server_that_is_no_sensor_is_an_error():
 
 
 def test_a_name_that_is_neither_file_nor_sensor_is_an_error():
-    with pytest.raises(SensorUnavailable, match="no file and no sensor nowhere.invalid"):
+    with pytest.raises(SensorUnavailable, match="there is no sensor nowhere.invalid .*check its name"):
         open_source("nowhere.invalid")
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:99999", "a b", "[::1", "os1:x", "x" * 300, "os\0", ".", "-"])
+def test_an_address_that_cannot_be_one_is_an_error(address):
+    with pytest.raises(SensorUnavailable) as caught:
+        live.LiveSource(address)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_sensor_with_its_lidar_off_is_an_error():

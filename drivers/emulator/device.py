@@ -122,9 +122,9 @@ class Device:
         self.generation += 1
 
     def _require_known(self, name: str, value: object) -> None:
-        if name not in self.config:
+        if name not in self.recorded:
             raise Refused(f"there is no parameter {name}")
-        if value not in CHOICES.get(name, (value,)):
+        if value not in (self.recorded[name], *CHOICES.get(name, (value,))):
             raise Refused(f"{name} cannot be {value!r}")
         if name == "lidar_mode" and value not in self._modes():
             raise Refused(f"lidar_mode cannot be {value!r}, as the capture turns at {self._fps} Hz")

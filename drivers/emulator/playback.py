@@ -3,6 +3,8 @@
 import numpy as np
 from ouster.sdk import core
 
+from ..packets import COLUMN_ID_OFFSET
+
 LONGEST_PAUSE_NS = 10_000_000_000  # in a capture; what lies farther ahead follows at once
 ID_BYTES, SERIAL_BYTES = 3, 5
 PLACES = {0xFFFF: (4, 7), 0xFFFFFFFF: (1, 11)}  # largest frame id -> where init id and serial are in a packet
@@ -15,42 +17,42 @@ class Timeline:
 
     def __init__(self, period_ns: int):
         self._period_ns = period_ns
-        self._end_ns = 0
-        self._shift_ns: int | None = None  # from the capture's clock to played time
+        self._start_ns = -period_ns  # played time at which the last rotation began
+        self._shift_ns: int | None = None
         self._id_shift: int | None = None
         self._next_id = 0
+        self.played_ns = 0  # up to the last packet
+
+    @property
+    def shift_ns(self) -> int | None:
+        """From the capture's clock to played time; None before the first lidar packet."""
+        return self._shift_ns
 
     def join(self) -> None:
-        """What comes next follows what has been played, whatever its time and id."""
+        """What comes next is the rotation after that which was played last, whatever its time and id."""
         self._shift_ns = self._id_shift = None
 
     def restart_ids(self) -> None:
         """Frame ids begin again with the next packet."""
         self._next_id, self._id_shift = 0, None
 
-    @property
-    def played_ns(self) -> int:
-        """How much time has been played."""
-        return self._end_ns
+    def place(self, start_ns: int, last_ns: int, frame_id: int, max_id: int) -> tuple[int, int]:
+        """A lidar packet of the capture: when its rotation began, its last column, its frame id.
 
-    def place(self, first_ns: int, last_ns: int, frame_id: int, max_id: int) -> tuple[int, int]:
-        """first_ns, last_ns, frame_id of a lidar packet of the capture -> shift of its times, frame id as played."""
+        Returns the shift of its times, and its frame id as played.
+        """
         if self._shift_ns is not None:
-            ahead_ns = first_ns + self._shift_ns - self._end_ns
+            ahead_ns = start_ns + self._shift_ns - self._start_ns
             if not -self._period_ns // 2 < ahead_ns < LONGEST_PAUSE_NS:  # packets out of order lie nearer
                 self.join()
         if self._shift_ns is None:
-            self._shift_ns = self._end_ns + self._period_ns // 100 - first_ns
+            self._shift_ns = self._start_ns + self._period_ns - start_ns
         if self._id_shift is None:
             self._id_shift = self._next_id - frame_id
         played_id = (frame_id + self._id_shift) % (max_id + 1)
-        self._end_ns, self._next_id = last_ns + self._shift_ns, played_id + 1
+        self._start_ns, self._next_id = start_ns + self._shift_ns, played_id + 1
+        self.played_ns = last_ns + self._shift_ns
         return self._shift_ns, played_id
-
-    @property
-    def shift_ns(self) -> int | None:
-        """Of the times of IMU packets, which come in between; None before the first lidar packet."""
-        return self._shift_ns
 
 
 class Rewriter:
@@ -64,6 +66,8 @@ class Rewriter:
         start, size = self._format.packet_header_size, self._format.col_size
         by_column = self.buffer[start : start + columns * size].reshape(columns, size)
         self._times = by_column[:, :8].view("<i8")[:, 0]
+        self._columns = by_column[:, COLUMN_ID_OFFSET : COLUMN_ID_OFFSET + 2].view("<u2")[:, 0]
+        self._column_ns = 1e9 / info.format.fps / info.format.columns_per_frame
         self._has_ids = info.format.udp_profile_lidar != core.UDPProfileLidar.LEGACY
 
     def rewrite(self, payload: bytes | np.ndarray, clock_ns: int, ids: tuple[int, int]) -> int | None:
@@ -76,10 +80,10 @@ class Rewriter:
         if not timed.any():
             return None
         times = self._times[timed]
-        last_ns = int(times.max())
-        shift_ns, frame_id = self._timeline.place(
-            int(times.min()), last_ns, self._packet.frame_id(), self._format.max_frame_id
-        )
+        last = int(times.argmax())
+        last_ns = int(times[last])
+        start_ns = last_ns - round(int(self._columns[timed][last]) * self._column_ns)
+        shift_ns, frame_id = self._timeline.place(start_ns, last_ns, self._packet.frame_id(), self._format.max_frame_id)
         self._times[timed] = times + (shift_ns + clock_ns)
         self._format.set_frame_id(self._packet, frame_id)
         if self._has_ids:
