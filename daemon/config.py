@@ -215,8 +215,10 @@ class StorageConfig(_Section):
     min_free_gb: float = Field(
         2.0, ge=0, description="10^9 bytes to stay free on its file system, for the robot's other programs"
     )
-    backup_interval_h: float = Field(6.0, gt=0, description="hours between two backups of changes.db")
-    backups_kept: int = Field(8, ge=1, description="backups of changes.db, the newest")
+    backup_interval_h: float = Field(
+        1.0, gt=0, description="hours between two backups of changes.db, where it has changed; one at each stop, too"
+    )
+    backups_kept: int = Field(24, ge=1, description="backups of changes.db, the newest")
 
 
 class Config(_Section):

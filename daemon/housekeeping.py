@@ -60,10 +60,11 @@ class Housekeeping:
         )
 
     def close(self) -> None:
-        """Finish the step at hand and end the thread."""
+        """Finish the step at hand, end the thread, and back up what was found since the last backup."""
         self._stopped = True
         self._store.grown.set()
         self._thread.join()
+        self._attempt(lambda: back_up_if_due(self._store.dir, 0.0, self._config.backups_kept))
 
     def __enter__(self) -> Housekeeping:
         return self

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from . import database
 from .datadir import DataDir
-from .errors import DatabaseCorrupt
+from .errors import DatabaseCorrupt, DatabaseFileError, NewerFormat
 from .files import make_dir, replace_durably
 from .schema import CHANGES_MIGRATIONS
 
@@ -21,13 +21,16 @@ NAME = "changes-%Y%m%dT%H%M%SZ.db"  # sorts by time
 
 
 def back_up_if_due(data_dir: DataDir, interval_s: float, kept: int) -> Path | None:
-    """Back changes.db up where the newest backup is older than this, and delete all but the newest `kept`.
+    """Back changes.db up if it holds anything new since the newest backup, and that is older than this; keep `kept`.
 
-    None where it is not due. Raises StorageUnavailable, DatabaseCorrupt: older backups stay then.
+    None where it is not due: the first is due with the first change. Raises StorageUnavailable, DatabaseCorrupt: older
+    backups stay then.
     """
     existing = backups(data_dir)
     # A clock that was set back makes the newest backup look to be of the future: age counts either way.
     if existing and abs(time.time() - existing[-1].stat().st_mtime) < interval_s:
+        return None
+    if _revision(data_dir.changes_path) == (_revision(existing[-1]) if existing else 0):
         return None
     made = _back_up(data_dir)
     for old in backups(data_dir)[:-kept]:
@@ -39,6 +42,15 @@ def back_up_if_due(data_dir: DataDir, interval_s: float, kept: int) -> Path | No
 def backups(data_dir: DataDir) -> list[Path]:
     """All finished backups, oldest first."""
     return sorted(data_dir.backups_path.glob(PATTERN))
+
+
+def _revision(path: Path) -> int | None:
+    """The last revision of a changes.db; None where it does not say."""
+    try:
+        with closing(database.open_reader(path, len(CHANGES_MIGRATIONS))) as db:
+            return db.value("SELECT last_revision FROM store")
+    except (DatabaseFileError, NewerFormat):
+        return None
 
 
 def _back_up(data_dir: DataDir) -> Path:

@@ -20,7 +20,14 @@ HOUR_S = 3600.0
 @pytest.fixture
 def store(tmp_path):
     with Store.open_writer(tmp_path / "data") as store:
+        store.changes.add(make_change())
         yield store
+
+
+def again(store):
+    """Another backup, of what has changed."""
+    store.changes.add(make_change())
+    return back_up_if_due(store.dir, HOUR_S, kept=3)
 
 
 def aged(path, hours):
@@ -41,19 +48,31 @@ def test_a_backup_is_made_when_the_last_is_old_enough(store):
     first = back_up_if_due(store.dir, HOUR_S, kept=3)
     assert back_up_if_due(store.dir, HOUR_S, kept=3) is None
     first = aged(first, hours=2)
-    second = back_up_if_due(store.dir, HOUR_S, kept=3)
+    second = again(store)
     assert backups(store.dir) == [first, second]
+
+
+def test_what_has_not_changed_is_not_backed_up_again(store):
+    aged(back_up_if_due(store.dir, HOUR_S, kept=3), hours=2)
+    assert back_up_if_due(store.dir, HOUR_S, kept=3) is None
+
+
+def test_an_empty_store_is_not_backed_up(tmp_path):
+    with Store.open_writer(tmp_path / "empty") as store:
+        assert back_up_if_due(store.dir, HOUR_S, kept=3) is None
 
 
 def test_the_newest_backups_are_kept(store):
     for hours in (4, 3, 2):
-        aged(back_up_if_due(store.dir, HOUR_S, kept=3), hours)
+        aged(again(store), hours)
+    store.changes.add(make_change())
     made = back_up_if_due(store.dir, HOUR_S, kept=2)
     assert [path.name for path in backups(store.dir)] == ["changes-20250107T000000Z.db", made.name]
 
 
 def test_a_backup_that_fails_costs_no_older_one_and_leaves_nothing(store, monkeypatch):
     old = aged(back_up_if_due(store.dir, HOUR_S, kept=1), hours=2)
+    store.changes.add(make_change())
     full = StorageFull("disk full")
 
     def fail(*_):
