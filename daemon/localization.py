@@ -80,12 +80,12 @@ class Localizer:
         return fix
 
     def prepare(self, scenes: list[Scene]) -> None:
-        """Read one more scan of the first of the scenes whose first visit is not in memory yet.
+        """Read one more scan of the nearest of the scenes (nearest first) whose first visit is not in memory yet.
 
         Asked at each key scan for the scenes ahead, it has them when the robot is there: reading one at a stroke would
         take as long as five frames.
         """
-        for scene in scenes:
+        for scene in scenes[:CACHED_REFERENCES]:  # more would push one another out
             if self._reference(scene).build_on():
                 return
 

@@ -6,7 +6,7 @@ import yard
 from scipy.spatial.transform import Rotation
 
 from revisitd.daemon.config import Config
-from revisitd.daemon.localization import Localizer
+from revisitd.daemon.localization import CACHED_REFERENCES, Localizer
 from revisitd.daemon.odometry import Health, Motion
 from revisitd.daemon.scenes import Scene
 from revisitd.daemon.sweep import summed_up
@@ -92,22 +92,36 @@ def test_in_a_new_place_the_prediction_stands_until_there_are_scans_before():
     np.testing.assert_array_equal(fix.T_map_sensor, pose)
 
 
-def test_a_scene_is_read_scan_by_scan_before_the_robot_is_there():
-    read = []
+@pytest.fixture
+def read():
+    """The scenes whose first visit was read, once for each scan."""
+    return []
 
+
+@pytest.fixture
+def reading(read):
     def first_visit_noted(scene):
         for cells in first_visit(scene):
             read.append(scene.scene_id)
             yield cells
 
+    return Localizer(Config().alignment, first_visit_noted, np.eye(4))
+
+
+def test_a_scene_is_read_scan_by_scan_before_the_robot_is_there(reading, read):
     ahead, behind = Scene(1, np.zeros((1, 2))), Scene(2, np.zeros((1, 2)))
-    known = Localizer(Config().alignment, first_visit_noted, np.eye(4))
     for _ in range(5):
-        known.prepare([ahead, behind])
+        reading.prepare([ahead, behind])
     assert read == [1, 1, 2, 2]
     pose = yard.pose(1.0, -2.0, 0.4)
-    assert known.locate(seen_from(pose, surface(1)), motion(pose), [ahead]).aligned
+    assert reading.locate(seen_from(pose, surface(1)), motion(pose), [ahead]).aligned
     assert read == [1, 1, 2, 2]
+
+
+def test_where_many_scenes_are_near_none_is_read_twice(reading, read):
+    for _ in range(40):
+        reading.prepare([Scene(i, np.zeros((1, 2))) for i in range(CACHED_REFERENCES + 3)])
+    assert read == sorted(2 * list(range(CACHED_REFERENCES)))
 
 
 def test_a_scan_of_clutter_is_refused_and_the_prediction_stands():
