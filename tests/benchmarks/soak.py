@@ -197,15 +197,17 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--work", type=Path, required=True, help="folder for everything, also the report")
     parser.add_argument("--capture", type=Path, help="a pcap with its metadata beside it; a virtual patrol without it")
+    parser.add_argument("--beams", type=int, default=64, help="of the virtual sensor")
+    parser.add_argument("--columns", type=int, default=1024)
     parser.add_argument("--quota-gb", type=float, default=0.3)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True)
     capture = arguments.capture
     if capture is None:
-        capture = virtual.simulate(
-            arguments.work / "patrol", scenario="demo", seed=arguments.seed, beams=64, profile="RNG15_RFL8_NIR8"
-        ).pcap
+        patrol = {"scenario": "demo", "seed": arguments.seed, "profile": "RNG15_RFL8_NIR8"}
+        size = {"beams": arguments.beams, "columns": arguments.columns}
+        capture = virtual.simulate(arguments.work / "patrol", **patrol, **size).pcap
     soak = Soak(arguments.work, capture, arguments.quota_gb, arguments.seed)
     try:
         soak.run(60 * arguments.minutes)
