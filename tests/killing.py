@@ -23,13 +23,13 @@ from stored import SESSION, make_scan, pose
 
 from revisitd.daemon.changes import ChangeManager, Finding
 from revisitd.daemon.detection.results import DetectedObject
+from revisitd.storage import retention
 from revisitd.storage.backup import back_up_if_due
 from revisitd.storage.fsck import check
 from revisitd.storage.store import Store
 
 VISIT_SCANS = 6
-NEVER_DELETED = 100  # scans, the newest: old visits go first
-QUOTA_BYTES = 12_000_000  # reached after some kills: scans are deleted from then on
+QUOTA_BYTES = 6_000_000  # reached after some kills: scans are deleted from then on
 GRID = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * 0.1
 
 
@@ -38,7 +38,13 @@ GRID = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshap
 
 def write(data: Path, seed: int) -> None:
     """Write until killed; a line of JSON for each thing that is stored."""
-    rng = random.Random(seed)
+    rng, discard = random.Random(seed), retention.discard
+
+    def discard_aloud(index, scans, ids) -> None:
+        say(deleting=ids)  # before it is done: whatever is absent without such a line was lost
+        discard(index, scans, ids)
+
+    retention.discard = discard_aloud
     with Store.open_writer(data) as store:
         say(opened=True)
         store.dir.put_sensor(SESSION["sensor_digest"], "{}")
@@ -102,6 +108,7 @@ class Acknowledged:
     """All that the killed writers were told is stored."""
 
     scans: set[tuple[int, int]] = field(default_factory=set)
+    deleting: set[tuple[int, int]] = field(default_factory=set)  # by the retention, perhaps not done yet
     visits: dict[int, list[int]] = field(default_factory=dict)
     revisions: dict[int, int] = field(default_factory=dict)  # the highest that was seen of each change
     sessions: set[int] = field(default_factory=set)
@@ -114,6 +121,8 @@ class Acknowledged:
             fact = json.loads(line)
             if "scan" in fact:
                 self.scans.add(tuple(fact["scan"]))
+            elif "deleting" in fact:
+                self.deleting.update(tuple(scan) for scan in fact["deleting"])
             elif "visit" in fact:
                 self.visits[fact["visit"]] = fact["scans"]
             elif "session" in fact:
@@ -154,8 +163,7 @@ def judge(data: Path, acknowledged: Acknowledged) -> tuple[list[str], float]:
     with store:
         wrong = [f"repaired: {repair}" for repair in store.repairs]
         rows = set(store.index.db.tuples("SELECT session_id, scan_id FROM scans"))
-        deleted = _deleted_by_retention(store, acknowledged.scans - rows, max(acknowledged.scans, default=(0, 0))[1])
-        wrong += [f"scan lost: {scan}" for scan in sorted(acknowledged.scans - rows - deleted)]
+        wrong += [f"scan lost: {scan}" for scan in sorted(acknowledged.scans - rows - acknowledged.deleting)]
         files = set(store.scans.iter_ids())
         wrong += [f"row without file: {scan}" for scan in sorted(rows - files)]
         unacknowledged = rows - acknowledged.scans
@@ -170,13 +178,6 @@ def judge(data: Path, acknowledged: Acknowledged) -> tuple[list[str], float]:
     findings = check(data)
     wrong += [line for line in findings.lines() if "that the index does not know" not in line]
     return wrong, start_s
-
-
-def _deleted_by_retention(store: Store, absent: set[tuple[int, int]], newest: int) -> set[tuple[int, int]]:
-    """Absent ones that may be: the quota was reached, they are not of the newest, and no file is left."""
-    full = sum(path.stat().st_size for path in store.dir.path.rglob("*") if path.is_file()) > 0.9 * QUOTA_BYTES
-    old = {scan for scan in absent if scan[1] <= newest - NEVER_DELETED}
-    return {scan for scan in old if full and not store.scans.path(*scan).exists()}
 
 
 def _wrong_visits(store: Store, acknowledged: Acknowledged) -> list[str]:
