@@ -158,6 +158,7 @@ class StatusBoard:
             quota_bytes=figures.quota_bytes,
             free_bytes=figures.free_bytes,
             problem=self._program.pipeline.disk_problem or figures.problem,
+            repairs=tuple(self._program.store.repairs),
             scans=figures.scans,
             scans_deleted=figures.scans_deleted,
             memory_bytes=_resident_bytes("self"),

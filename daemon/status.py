@@ -89,6 +89,7 @@ class StoreStatus:
     scans: int
     scans_deleted: int  # by retention, since the start
     problem: str  # why key scans are not stored, or the quota is not kept; empty where all is well
+    repairs: tuple[str, ...]  # what opening the store had to put right
     memory_bytes: int  # resident, of this process
     detection_memory_bytes: int  # resident, of the detection process
 
@@ -175,6 +176,7 @@ def status_table(status: dict) -> str:
         ),
         ("not stored", f"{frames['not_stored']} key scans" if frames["not_stored"] else ""),
         ("", store["problem"]),
+        *(("repaired", what) for what in store["repairs"]),
         ("memory", f"{store['memory_bytes'] >> 20} + {store['detection_memory_bytes'] >> 20} MiB"),
         ("model", status["model_id"]),
         ("settings", status["settings"]),

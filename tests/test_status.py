@@ -29,7 +29,7 @@ SENSOR = SensorStatus("os-1.local", "running", "", 0, 1, "122", "OS-1-64", "v3.1
 FRAMES = FrameStatus(10.0, 100, 2, 0, 0.001, {"columns missing": 16, 'odd "cause"': 1})
 PLACE = PlaceStatus("good", 1, 3, 1, (4, 5), 20, (1,))
 DETECTION = DetectionStatus(0.0, 0, 7, 0, 0, 2, 9)
-STORE = StoreStatus("/data", 5_000_000_000, 50_000_000_000, 41_000_000_000, 1200, 0, "", 200 << 20, 300 << 20)
+STORE = StoreStatus("/data", 5_000_000_000, 50_000_000_000, 41_000_000_000, 1200, 0, "", ("index.db was lost",), 200 << 20, 300 << 20)
 
 
 @pytest.fixture
@@ -60,6 +60,7 @@ def test_no_status_is_exit_code_3(tmp_path):
 def test_people_see_each_subject_on_a_line(tmp_path, status):
     table = status_table(asdict(status))
     assert "state      running: good 10.0 Hz, loss 0.1%, scene 4, 5, 9 changes, 41 GB free" in table
+    assert "repaired   index.db was lost" in table
     assert "up 1 min 30 s" in table and "16 x columns missing" in table
 
 
