@@ -29,7 +29,8 @@ SENSOR = SensorStatus("os-1.local", "running", "", 0, 1, "122", "OS-1-64", "v3.1
 FRAMES = FrameStatus(10.0, 100, 2, 0, 0.001, {"columns missing": 16, 'odd "cause"': 1})
 PLACE = PlaceStatus("good", 1, 3, 1, (4, 5), 20, (1,))
 DETECTION = DetectionStatus(0.0, 0, 7, 0, 0, 2, 9)
-STORE = StoreStatus("/data", 5_000_000_000, 50_000_000_000, 41_000_000_000, 1200, 0, "", ("index.db was lost",), 200 << 20, 300 << 20)
+SIZES = 5_000_000_000, 50_000_000_000, 41_000_000_000  # used, quota, free
+STORE = StoreStatus("/data", *SIZES, 1200, 0, "", ("index.db was lost",), 200 << 20, 300 << 20)
 
 
 @pytest.fixture
