@@ -144,7 +144,14 @@ def read_status(data: Path | None) -> dict:
 
 
 def status_table(status: dict) -> str:
-    """For people: one subject a line."""
+    """For people: one subject a line. Raises NotRunning for a status that another version of revisitd writes."""
+    try:
+        return _table(status)
+    except KeyError as missing:
+        raise NotRunning(f"another version of revisitd runs, its status has no {missing}: restart it") from None
+
+
+def _table(status: dict) -> str:
     sensor, frames, place = status["sensor"], status["frames"], status["place"]
     detection, store = status["detection"], status["store"]
     up_s = (status["updated_host_ns"] - status["started_host_ns"]) * 1e-9

@@ -102,9 +102,9 @@ def status_of(data):
 
 
 def test_it_waits_for_its_sensor_follows_it_and_stops_in_order(start, capture, tmp_path):
-    port = free_port()
-    data = tmp_path / "data"
-    daemon = start("run", "--source", f"127.0.0.1:{port}", "--data", data, WATCHDOG_USEC="4000000")
+    port, data, settings = free_port(), tmp_path / "data", tmp_path / "revisitd.toml"
+    settings.write_text(f'[sensor]\naddress = "127.0.0.1:{port}"\nudp_port_lidar = {free_port()}\n')
+    daemon = start("run", "--config", settings, "--data", data, WATCHDOG_USEC="4000000")
     daemon.says("no sensor answers")
     until(lambda: "READY=1" in daemon.told and status_of(data), "ready without a sensor")
     until(lambda: "no sensor answers" in status_of(data)["sensor"]["problem"], "the problem is told")

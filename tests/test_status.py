@@ -65,6 +65,13 @@ def test_people_see_each_subject_on_a_line(tmp_path, status):
     assert "up 1 min 30 s" in table and "16 x columns missing" in table
 
 
+def test_a_status_of_another_version_is_named(status):
+    old = asdict(status)
+    del old["store"]["repairs"]
+    with pytest.raises(NotRunning, match="another version"):
+        status_table(old)
+
+
 @pytest.mark.parametrize(
     "changed,state,says",
     [

@@ -62,10 +62,11 @@ def status(ctx: click.Context, data: Path | None, as_json: bool) -> None:
 
     try:
         found = read_status(data)
+        text = json.dumps(found, indent=1) if as_json else status_table(found)
     except NotRunning as why:
         click.echo(f"Error: {why}", err=True)
         ctx.exit(NOT_RUNNING)
-    click.echo(json.dumps(found, indent=1) if as_json else status_table(found))
+    click.echo(text)
 
 
 @click.command()
