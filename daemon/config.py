@@ -110,11 +110,12 @@ class SceneConfig(_Section):
     """Scene identification (CDSD Algorithm 1)."""
 
     alpha_m2: float = Field(120.0, gt=0, description="largest area of a scene (CDSD Table III)")
-    beta: float = Field(
-        1.2,
-        gt=0,
-        le=2,
-        description="largest descriptor distance between two scans of a scene; the model's card: an overlap of 23 %",
+    min_overlap: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="least overlap expected of two scans of a scene; the paper's beta is the distance of descriptors at"
+        " which the model's card expects it",
     )
     margin_m: float = Field(
         2.5, gt=0, description="a scene is its hull grown by this: a straight path has an area, a second lane is inside"

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..models.descriptor import DescriptorModel
 from ..storage.errors import StorageUnavailable
 from ..storage.index import InstanceRow, SceneScans
 from ..storage.store import Store
@@ -19,7 +20,7 @@ from .config import Config
 from .detection.results import DetectedObject, Thresholds
 from .detection_process import DetectionProcess, JobFailed, Stopped
 from .moments import in_order
-from .submaps import select
+from .submaps import select, unshared
 from .worker import Instance
 
 logger = logging.getLogger(__name__)
@@ -40,10 +41,10 @@ class Rejected(Exception):
 class ChangeDetection:
     """Runs instances on stored scans; called by the detection thread alone."""
 
-    def __init__(self, config: Config, store: Store, process: DetectionProcess, model_id: str):
+    def __init__(self, config: Config, store: Store, process: DetectionProcess, model: DescriptorModel):
         self._config = self._wanted = config
         self._store = store
-        self._model_id = model_id
+        self._model = model
         self._manager = ChangeManager(store.changes)
         self._process = process
         self.n_changes = 0  # change objects new in this run
@@ -107,14 +108,15 @@ class ChangeDetection:
 
     def _choose(self, scans: SceneScans) -> Selection:
         """Of the scans whose poses can be trusted in this scene, those that represent the visits best (OptMap)."""
-        usable = scans.only(((scans.visit_number == 1) | scans.aligned) & (scans.model_id == self._model_id))
+        usable = scans.only((scans.visit_number == 1) | scans.aligned)
         if len(usable.scan_id) < MIN_SCANS:
             raise Rejected(
                 f"{len(usable.scan_id)} of {len(scans.scan_id)} scans are aligned to the scene's first visit, "
                 f"at least {MIN_SCANS} are needed"
             )
         chosen = np.zeros(len(usable.scan_id), dtype=bool)
-        chosen[select(usable.descriptors, usable.visit_number, submap_scans(self._config))] = True
+        apart = unshared(usable.descriptors, usable.model_id, self._model.overlap_from_distance)
+        chosen[select(apart, usable.visit_number, submap_scans(self._config))] = True
         moment = in_order(usable.session, usable.stamp_ns)
         position_m = usable.T_map_sensor[:, :3, 3]
         return Selection(usable.session, usable.scan_id, usable.visit_number, moment, position_m, chosen)
@@ -169,7 +171,7 @@ class ChangeDetection:
                 after.host_ns[found.after_ns],
                 before.session[found.before_ns],
                 after.residual_m,
-                self._model_id,
+                self._model.model_id,
                 self._config.digest,
             )
             found = replace(found, before_ns=before.stamp_ns[found.before_ns], after_ns=after.stamp_ns[found.after_ns])

@@ -190,7 +190,8 @@ class Pipeline:
     def _start_session(self, frame: Frame) -> Session:
         maps = self._store.index.maps_to_join()
         self._joiner = Joiner(self._ask_where, maps, self._config.alignment, self._wait) if maps else None
-        self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source)
+        beta = float(self._model.distance_from_overlap(self._config.scenes.min_overlap))
+        self._session = Session(self._config, self._store, self._sensors, frame.sensor, self._source, beta)
         sensor = frame.sensor
         logger.info(
             "session %d starts sensor=%s clock=%s host_ahead_s=%.3f",

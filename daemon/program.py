@@ -35,7 +35,7 @@ class Program:
             joining = ThreadPoolExecutor(1, thread_name_prefix="joining")
             opened.callback(joining.shutdown, cancel_futures=True)
             self.housekeeping = opened.enter_context(Housekeeping(self.store, config))
-            self.detection = ChangeDetection(config, self.store, self.process, self.model.model_id)
+            self.detection = ChangeDetection(config, self.store, self.process, self.model)
             # Visits whose instance was still due when the last run ended, killed perhaps.
             self.worker = DetectionWorker(self.detection.run, config.worker.queue_size, self.detection.due())
             opened.callback(self.worker.close)

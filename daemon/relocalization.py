@@ -24,7 +24,7 @@ from .registration import Match, Surface, align, judge, scan_cloud, surface_of
 from .sensors import Sensors
 from .views import sensor_points
 
-SCENES = 20  # nearest by descriptor: it is right at once in three of four cases only
+SCENES = 20  # nearest by descriptor, which is not always right at once
 GUESSES_PER_SCENE = 3
 GUESSES = 6  # verified, best plans first
 PLAN_SCANS = 5  # of a scene's first visit
@@ -95,14 +95,13 @@ class Relocator:
         return next((answer for answer in answers if not answer.reason), answers[0])
 
     def _places_like(self, descriptor: np.ndarray, model_id: str, maps: list[int]) -> list[Place]:
-        """The scenes of these maps whose scans lie nearest by descriptor."""
-        scenes, scene_maps, descriptors = self._store.index.scene_descriptors(model_id, maps)
-        if len(scenes) == 0:  # described by another model
-            return []
-        order = np.argsort(-(descriptors @ descriptor), kind="stable")
-        _, first = np.unique(scenes[order], return_index=True)
-        nearest = order[np.sort(first)[:SCENES]]
-        places = [self._place(int(scene_maps[i]), int(scenes[i])) for i in nearest]
+        """The scenes of these maps whose scans lie nearest by descriptor; last, those that another model described."""
+        index = self._store.index
+        scenes, descriptors = index.scene_descriptors(model_id, maps)
+        ranked = scenes[np.argsort(-(descriptors @ descriptor), kind="stable")] if len(scenes) else scenes
+        map_of = {row.scene_id: map_id for map_id in maps for row in index.scenes(map_id)}
+        nearest = list(dict.fromkeys([*ranked.tolist(), *map_of]))[:SCENES]
+        places = [self._place(map_of[scene_id], scene_id) for scene_id in nearest]
         return [place for place in places if place is not None]
 
     def _load_place(self, map_id: int, scene_id: int) -> Place | None:

@@ -83,12 +83,15 @@ class SceneUpdate:
 class SceneTracker:
     """Builds scenes while the robot explores, and notes visits to the scenes that stand.
 
+    beta: the largest distance between two descriptors of a scene.
+
     Memory: one polygon for each scene of the map (some hundred bytes for 20 m of path), and the descriptors of
-    the scene that is being built.
+    the scene that is being built: those of this session, all by one model.
     """
 
-    def __init__(self, config: SceneConfig, scenes: list[Scene], next_scene_id: int):
+    def __init__(self, config: SceneConfig, beta: float, scenes: list[Scene], next_scene_id: int):
         self._config = config
+        self._beta = beta
         self._scenes = {scene.scene_id: scene for scene in scenes}
         self._next_scene_id = next_scene_id
         self._open_visits: dict[int, Visit] = {}
@@ -135,7 +138,7 @@ class SceneTracker:
         hull = convex_hull(np.vstack([self._hull, xy]))  # line 7
         too_large = grown_area_m2(hull, self._config.margin_m) > self._config.alpha_m2
         spread = np.linalg.norm(np.array(self._descriptors) - descriptor, axis=1).max()
-        if not too_large and spread <= self._config.beta:  # line 8
+        if not too_large and spread <= self._beta:  # line 8
             self._hull = hull  # line 17
             self._descriptors.append(descriptor)
             self._current.take(scan_id, stamp_ns, xy)

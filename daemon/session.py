@@ -32,15 +32,20 @@ class Session:
         sensors: Sensors,
         sensor: Sensor,
         source: str,
+        beta: float,
         join: Join | None = None,
         continues: Session | None = None,
     ):
-        """A session with a map of its own; with a join, the one that continues another in an earlier map."""
+        """A session with a map of its own; with a join, the one that continues another in an earlier map.
+
+        beta: the largest distance between two descriptors of a scene.
+        """
         self._config = config
         self._store = store
         self._sensors = sensors
         self._sensor = sensor
         self._source = source
+        self._beta = beta
         sensors.put(sensor)
         self.session_id = store.index.start_session(
             source=source,
@@ -62,11 +67,11 @@ class Session:
         self.localizer = Localizer(config.alignment, self._load_reference, T_map_odom)
         known = [Scene(row.scene_id, row.hull, row.n_visits) for row in store.index.scenes(self.map_id)]
         self._unrecorded: list[SceneUpdate] = []  # what the disk has not taken yet
-        self.scenes = SceneTracker(config.scenes, known, store.index.next_scene_id())
+        self.scenes = SceneTracker(config.scenes, beta, known, store.index.next_scene_id())
 
     def joined(self, join: Join) -> Session:
         """The session that goes on from this one, which has ended, in an earlier map: the same odometry, no break."""
-        return Session(self._config, self._store, self._sensors, self._sensor, self._source, join, self)
+        return Session(self._config, self._store, self._sensors, self._sensor, self._source, self._beta, join, self)
 
     def scenes_to_align_with(self, T_odom_sensor: np.ndarray, ahead_m: float = 0.0) -> list[Scene]:
         """Known scenes that the robot may be in, or come to within ahead_m, nearest first; not those in the making."""

@@ -18,7 +18,8 @@ import numpy as np
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 import onnxruntime  # noqa: E402
 
-from .preprocess import INPUT_SHAPE, Resampler  # noqa: E402
+from .features import FEATURE_SHAPES, features  # noqa: E402
+from .preprocess import Resampler  # noqa: E402
 
 DESCRIPTOR_LENGTH = 256
 DEFAULT_MODEL = Path(__file__).with_name("descriptor.onnx")
@@ -38,7 +39,6 @@ class DescriptorModel:
         self.model_id = model_id
         self.card = card
         self._session = session
-        self._input_name = session.get_inputs()[0].name
         curve = card["calibration"]
         self._distances = np.asarray(curve["distance"], np.float64)
         self._overlaps = np.asarray(curve["overlap"], np.float64)
@@ -65,8 +65,8 @@ class DescriptorModel:
         range_mm: (H, W) uint32 mm, staggered, 0 = no return; pixel_shift: (H,) int destagger shift;
         altitude_rad: (H,) beam altitudes, row 0 on top. ValueError if W is not a multiple of 256.
         """
-        scan = self._resampler_for(pixel_shift, altitude_rad, range_mm.shape[1])(range_mm)
-        return self._session.run(None, {self._input_name: scan[None]})[0][0]
+        image = self._resampler_for(pixel_shift, altitude_rad, range_mm.shape[1])(range_mm)
+        return self._session.run(None, {name: view[None] for name, view in features(image).items()})[0][0]
 
     def overlap_from_distance(self, distance: np.ndarray | float) -> np.ndarray | float:
         """Expected overlap, in [0, 1], of two scans whose descriptors lie `distance` apart."""
@@ -119,11 +119,12 @@ def _open_session(path: Path, content: bytes) -> onnxruntime.InferenceSession:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises a dozen unrelated classes for one unusable file
         raise ModelError(f"onnxruntime cannot load model {path}: {error}") from error
-    inputs = [list(value.shape) for value in session.get_inputs()]
+    inputs = {value.name: list(value.shape) for value in session.get_inputs()}
     outputs = [list(value.shape) for value in session.get_outputs()]
-    if inputs != [[1, *INPUT_SHAPE]] or outputs != [[1, DESCRIPTOR_LENGTH]]:
+    wanted_inputs = {name: [1, *shape] for name, shape in FEATURE_SHAPES.items()}
+    if inputs != wanted_inputs or outputs != [[1, DESCRIPTOR_LENGTH]]:
         raise ModelError(
-            f"model {path} maps {inputs} to {outputs}, want [[1, {', '.join(map(str, INPUT_SHAPE))}]]"
-            f" to [[1, {DESCRIPTOR_LENGTH}]]"
+            f"model {path} maps {inputs} to {outputs}, want {wanted_inputs} to [[1, {DESCRIPTOR_LENGTH}]]:"
+            " restore the model that came with this version"
         )
     return session

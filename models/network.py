@@ -1,12 +1,13 @@
 """The descriptor network (training only; inference runs the exported ONNX file by descriptor.py).
 
-Fixed statistics of the scan's geometry, then a learned head. Turning the sensor rolls the input's columns,
-and every statistic is a sum, a maximum, a sorted list or a Fourier amplitude over the columns: none of them
-changes. The statistics are chosen so that scans of one place taken some metres apart have similar ones
-(surfaces by height, distances between obstacles), the head learns which of them tell overlap. Training
-takes minutes on one core. A small convolutional network was tried for 200 to 400 steps only (some minutes
-each) and was worse at that point; it was not trained to the end, so this says nothing about what it would
-reach.
+It reads the views of features.py and describes them in three ways, none of which a roll of the columns changes:
+
+- shares of each cell of height and distance over all directions: alike some metres apart,
+- a small convolutional network over the grid, circular in azimuth: the shape of the place,
+- another one over the spectrum's directions: what is alike wherever the same things are in sight.
+
+The networks see one sector in SECTOR_COLUMNS columns. The training takes one such set of sectors, inference all of
+them: so a turn by any number of columns changes nothing.
 """
 
 from __future__ import annotations
@@ -16,156 +17,177 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from .preprocess import LOG_RANGE_GAIN, N_COLUMNS, N_ROWS, row_elevation_rad
+from .features import FEATURE_SHAPES, N_HEIGHTS, N_RINGS, N_ROW_GROUPS, RING_REACH_M, SECTOR_COLUMNS
+from .preprocess import N_COLUMNS
 
 DESCRIPTOR_LENGTH = 256
-N_WAVES = 16
-# Heights relative to the sensor, metres, between which the nearest surface of each column is an obstacle's.
-LAYERS_M = ((-0.7, 0.6), (0.6, 2.5), (2.5, 7.0))
-FAR_M = 90.0  # stands for "no obstacle"
-OFFSETS = (1, 2, 3, 5, 8, 12, 18, 26, 37, 50, 64, 80, 96, 112, 128)  # columns between two obstacle points
-QUANTILES = 16
-AREA_REACH_M = 50.0
-
-
-class Statistics(nn.Module):
-    """(B, 3, 32, 256) inputs of preprocess.py -> (B, N_STATISTICS), unchanged by a roll of the columns."""
-
-    def __init__(self):
-        super().__init__()
-        elevation = torch.from_numpy(row_elevation_rad()).float()[:, None]
-        turn = torch.arange(N_COLUMNS) * (2 * np.pi / N_COLUMNS)
-        bounds = torch.tensor(LAYERS_M)[:, :, None, None]
-        for name, value in {
-            "sine": torch.sin(elevation),
-            "cosine": torch.cos(elevation),
-            "waves": _fourier_basis(),
-            "heading": torch.stack((torch.cos(turn), torch.sin(turn))),
-            "low": bounds[:, 0],
-            "high": bounds[:, 1],
-            "log_ranges": torch.linspace(0.5, 4.7, 16),
-            "heights": torch.linspace(-1.2, 3.4, 16),  # of _squashed(metres)
-            "area_heights": torch.linspace(-1.6, 3.4, 24),
-            "log_reaches": torch.linspace(0.8, 4.6, 14),
-            "log_gaps": torch.linspace(-1.5, 4.5, 16),
-        }.items():
-            self.register_buffer(name, value, persistent=False)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        log_range, hits, looked = x[:, 0] / LOG_RANGE_GAIN, x[:, 1], x[:, 2]
-        ranges = torch.exp(log_range)
-        height, reach = ranges * self.sine, ranges * self.cosine
-        # What was not looked at is left out of every mean, so that lost columns change little.
-        scale = N_ROWS * N_COLUMNS / looked.sum((1, 2)).clamp(min=1.0)[:, None]
-        seen = hits * scale[:, :, None]
-        obstacles = self._obstacles(hits, height, reach)
-        parts = (
-            self._ranges_by_row(log_range, seen),
-            self._spin_image(height, reach, seen),
-            self._area_by_height(height, ranges, hits),
-            (seen.mean(2), looked.mean(2)),
-            (self._wave_amplitudes(torch.stack((x[:, 0] * hits, hits), dim=1).unflatten(2, (16, 2)).mean(3)),),
-            self._obstacle_shape(obstacles),
-        )
-        return torch.cat([part.flatten(1) for group in parts for part in group], dim=1)
-
-    def _ranges_by_row(self, log_range: torch.Tensor, seen: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Share of each pair of rows that lies in each bin of range."""
-        binned = _binned(log_range, self.log_ranges) * seen[..., None]
-        return (torch.sqrt(binned.unflatten(1, (16, 2)).mean((2, 3)) + 1e-4),)
-
-    def _spin_image(self, height: torch.Tensor, reach: torch.Tensor, seen: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Share of the returns in each bin of height and horizontal distance."""
-        by_height = (_binned(_squashed(height), self.heights) * seen[..., None]).flatten(1, 2)
-        by_reach = _binned(torch.log(reach), self.log_reaches).flatten(1, 2)
-        spin = by_height.transpose(1, 2) @ by_reach / (N_ROWS * N_COLUMNS)
-        return spin.mul(30.0), torch.sqrt(spin + 1e-5).mul(8.0)
-
-    def _area_by_height(
-        self, height: torch.Tensor, ranges: torch.Tensor, hits: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
-        """Share of the surface (not of the returns) at each height: alike from near and from far."""
-        area = hits * (ranges.clamp(max=AREA_REACH_M) ** 2) * (ranges < AREA_REACH_M)
-        by_height = (_binned(_squashed(height), self.area_heights) * area[..., None]).sum((1, 2))
-        total = by_height.sum(1, keepdim=True)
-        return torch.sqrt(by_height / (total + 1.0)), torch.log(total + 1.0) / 10
-
-    def _wave_amplitudes(self, rings: torch.Tensor) -> torch.Tensor:
-        """Amplitudes of the first waves around the ring of columns, of any (..., N_COLUMNS)."""
-        cosine, sine = (rings @ self.waves).chunk(2, dim=-1)
-        return torch.sqrt(cosine * cosine + sine * sine + 1e-6)
-
-    def _obstacles(self, hits: torch.Tensor, height: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-        """(B, layers, N_COLUMNS) horizontal distance to the nearest surface in each layer, FAR_M where none."""
-        inside = (height[:, None] >= self.low) & (height[:, None] < self.high) & (hits[:, None] > 0)
-        return torch.where(inside, reach[:, None], torch.full_like(reach[:, None], FAR_M)).amin(2).clamp(0.5, FAR_M)
-
-    def _obstacle_shape(self, obstacles: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Of each layer: sorted distances, wave amplitudes, and how far obstacles are from one another."""
-        log_reach = torch.log(obstacles)
-        step = N_COLUMNS // QUANTILES
-        ordered = torch.sort(log_reach, dim=2).values[..., step // 2 :: step]
-        near = torch.exp(-obstacles / 15.0)
-        points = obstacles[:, :, None] * self.heading
-        is_there = (obstacles < FAR_M).float()
-        apart = []
-        for offset in OFFSETS:
-            gap = (points - _rolled(points, offset)).square().sum(2).clamp(min=1e-4).log() / 2
-            both = is_there * _rolled(is_there, offset)
-            apart.append((_binned(gap, self.log_gaps) * both[..., None]).mean(2))
-        shares = torch.stack(apart, dim=2)
-        return ordered, self._wave_amplitudes(near), is_there.mean(2), torch.sqrt(shares + 1e-4)
+N_SECTORS = N_COLUMNS // SECTOR_COLUMNS
+GRID_CHANNELS = (12, 16)
+RING_CHANNELS = 48
+RING_DILATIONS = (1, 2, 4)
+SPECTRUM_DILATIONS = (1, 2)
+N_WAVES, WAVE_CHANNELS = 8, 16
+HIDDEN = 512
+DROPOUT = 0.1
+OCCUPIED_GAIN = 3.0  # a third of a sector's rows in one cell fills it to two thirds
+AREA_REACH_M = 45.0
 
 
 class DescriptorNetwork(nn.Module):
-    """(B, 3, 32, 256) input of preprocess.py -> (B, 256) unit vectors: `statistics`, then `head`."""
+    """grid (B, 8, 24, W), rows (B, 24, W), spectrum (B, 32, W / 2) -> (B, 256) unit vectors.
 
-    def __init__(self, hidden: int = 512):
+    W is N_COLUMNS, all of features.py, or N_SECTORS: one column in each SECTOR_COLUMNS.
+    """
+
+    def __init__(self):
         super().__init__()
-        self.statistics = Statistics()
-        n = self.statistics(torch.zeros(1, 3, N_ROWS, N_COLUMNS)).shape[1]
-        self.register_buffer("mean", torch.zeros(n))
-        self.register_buffer("spread", torch.ones(n))
-        self.layers = nn.Sequential(
-            nn.Dropout(0.2),
-            nn.Linear(n, hidden),
+        self.shares = Shares()
+        self.grid = GridNetwork()
+        self.spectrum = RingNetwork(FEATURE_SHAPES["spectrum"][0], N_SECTORS // 2, SPECTRUM_DILATIONS)
+        n = self.shares.n_outputs + self.grid.n_outputs + self.spectrum.n_outputs + FEATURE_SHAPES["spectrum"][0]
+        self.head = nn.Sequential(
+            nn.BatchNorm1d(n),
+            nn.Dropout(DROPOUT),
+            nn.Linear(n, HIDDEN),
+            nn.BatchNorm1d(HIDDEN),
             nn.ReLU(),
-            nn.Dropout(0.2),
-            nn.Linear(hidden, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, DESCRIPTOR_LENGTH),
+            nn.Dropout(DROPOUT),
+            nn.Linear(HIDDEN, DESCRIPTOR_LENGTH),
         )
 
+    def forward(self, grid: torch.Tensor, rows: torch.Tensor, spectrum: torch.Tensor) -> torch.Tensor:
+        filled = 1.0 - torch.exp(-OCCUPIED_GAIN * grid)
+        described = (
+            self.shares(grid, filled, rows),
+            self.grid(filled, rows),
+            self.spectrum(spectrum),
+            spectrum.mean(2),
+        )
+        return functional.normalize(self.head(torch.cat(described, dim=1)), dim=1, eps=1e-6)
+
+
+class Shares(nn.Module):
+    """What there is at each height and distance, whatever its direction; nothing is learned here."""
+
+    n_outputs = 2 * N_HEIGHTS * N_RINGS + 6 * N_ROW_GROUPS + N_HEIGHTS
+
+    def __init__(self):
+        super().__init__()
+        rings_m = torch.logspace(*np.log10(RING_REACH_M), N_RINGS)
+        # The area of a ring's cell, and some for what is hidden behind: surfaces count alike from near and from far.
+        self.register_buffer("area", rings_m**1.5 / 100.0 * (rings_m < AREA_REACH_M), persistent=False)
+
+    def forward(self, grid: torch.Tensor, filled: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        mean = filled.mean(3)
+        parts = (
+            torch.sqrt(grid.mean(3) + 1e-3),
+            _spread(mean, (filled * filled).mean(3)),
+            rows.mean(2),
+            _spread(rows.mean(2), (rows * rows).mean(2)),
+            torch.sqrt((mean * self.area).sum(2) + 1e-3),
+        )
+        return torch.cat([part.flatten(1) for part in parts], dim=1)
+
+
+class GridNetwork(nn.Module):
+    """Convolutions over rings and sectors, then over sectors alone."""
+
+    def __init__(self):
+        super().__init__()
+        few, more = GRID_CHANNELS
+        self.over_rings = nn.Sequential(
+            CircularConv(N_HEIGHTS, few, (3, 3), ring_step=2),
+            nn.ReLU(),
+            CircularConv(few, more, (3, 3), ring_step=2),
+            nn.ReLU(),
+        )
+        self.around = RingNetwork(more * N_RINGS // 4 + 3 * N_ROW_GROUPS, N_SECTORS, RING_DILATIONS, N_WAVES)
+        self.n_outputs = self.around.n_outputs
+
+    def forward(self, filled: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        sectors = self.over_rings(_every_set(filled, N_SECTORS))
+        sets = torch.cat((sectors.flatten(1, 2), _every_set(rows, N_SECTORS)), dim=1)
+        return self.around.pooled(sets, len(filled))
+
+
+class RingNetwork(nn.Module):
+    """Residual circular convolutions over a ring of sectors, and what of them a turn does not change."""
+
+    def __init__(self, n_inputs: int, n_sectors: int, dilations: tuple[int, ...], n_waves: int = 0):
+        super().__init__()
+        self.n_sectors = n_sectors
+        self.enter = nn.Sequential(CircularConv(n_inputs, RING_CHANNELS, (1, 3)), nn.ReLU())
+        self.blocks = nn.ModuleList([Residual(RING_CHANNELS, dilation) for dilation in dilations])
+        self.n_outputs = 3 * RING_CHANNELS + n_waves * WAVE_CHANNELS
+        self.waves = Waves(n_waves) if n_waves else None
+
+    def forward(self, ring: torch.Tensor) -> torch.Tensor:
+        """(B, n_inputs, all columns or one set of sectors) -> (B, n_outputs)."""
+        return self.pooled(_every_set(ring, self.n_sectors), len(ring))
+
+    def pooled(self, sets: torch.Tensor, n_scans: int) -> torch.Tensor:
+        """(B * sets, n_inputs, sectors) -> (B, n_outputs): statistics over all sectors of all sets of a scan."""
+        y = self.enter(sets[:, :, None])
+        for block in self.blocks:
+            y = block(y)
+        y = y[:, :, 0]
+        by_scan = (-1, n_scans)
+        mean = y.mean(2).unflatten(0, by_scan).mean(0)
+        square = (y * y).mean(2).unflatten(0, by_scan).mean(0)
+        parts = [mean, y.amax(2).unflatten(0, by_scan).amax(0), _spread(mean, square)]
+        if self.waves is not None:
+            parts.append(self.waves(y).unflatten(0, by_scan).mean(0))
+        return torch.cat(parts, dim=1)
+
+
+class Waves(nn.Module):
+    """Amplitudes of the first waves around the ring, of some mixtures of its channels."""
+
+    def __init__(self, n_waves: int):
+        super().__init__()
+        angle = torch.arange(1, n_waves + 1) * (torch.arange(N_SECTORS)[:, None] * (2 * np.pi / N_SECTORS))
+        waves = torch.cat((torch.cos(angle), torch.sin(angle)), dim=1) * (2.0 / N_SECTORS)
+        self.register_buffer("waves", waves, persistent=False)
+        self.mix = nn.Conv1d(RING_CHANNELS, WAVE_CHANNELS, 1)
+
+    def forward(self, ring: torch.Tensor) -> torch.Tensor:
+        cosine, sine = (self.mix(ring) @ self.waves).chunk(2, dim=-1)
+        return torch.sqrt(cosine * cosine + sine * sine + 1e-4).flatten(1)
+
+
+class CircularConv(nn.Module):
+    """Convolution over (rings, sectors): circular over sectors, zeros beyond the first and last ring; normalised."""
+
+    def __init__(self, n_in: int, n_out: int, kernel: tuple[int, int], ring_step: int = 1, dilation: int = 1):
+        super().__init__()
+        self.margin = (kernel[1] // 2) * dilation
+        padding = (kernel[0] // 2, 0)
+        self.conv = nn.Conv2d(n_in, n_out, kernel, (ring_step, 1), padding, (1, dilation), bias=False)
+        self.norm = nn.BatchNorm2d(n_out)
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.head(self.statistics(x))
-
-    def standardise(self, statistics: torch.Tensor) -> None:
-        """Sets the head's scale of each statistic from those of the training scans, (M, N_STATISTICS)."""
-        self.mean.copy_(statistics.mean(0))
-        self.spread.copy_(statistics.std(0).clamp(min=0.01))
-
-    def head(self, statistics: torch.Tensor) -> torch.Tensor:
-        """(B, N_STATISTICS) -> (B, 256) unit vectors."""
-        standard = ((statistics - self.mean) / self.spread).clamp(-4.0, 4.0)
-        return functional.normalize(self.layers(standard), dim=1, eps=1e-6)
+        if self.margin:
+            x = torch.cat((x[..., -self.margin :], x, x[..., : self.margin]), dim=-1)
+        return self.norm(self.conv(x))
 
 
-def _binned(values: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
-    """(...,) -> (..., n): how much of each value falls into each of the evenly spaced, overlapping bins."""
-    per_step = 1.0 / (centres[1] - centres[0])
-    return functional.relu(1.0 - ((values * per_step)[..., None] - centres * per_step).abs())
+class Residual(nn.Module):
+    """A block that adds to its input."""
+
+    def __init__(self, channels: int, dilation: int):
+        super().__init__()
+        self.wide = CircularConv(channels, channels, (1, 3), dilation=dilation)
+        self.point = CircularConv(channels, channels, (1, 1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return functional.relu(x + self.point(functional.relu(self.wide(x))))
 
 
-def _squashed(height: torch.Tensor) -> torch.Tensor:
-    """Metres near the sensor's height, logarithmic away from it."""
-    return torch.sign(height) * torch.log1p(height.abs())
+def _every_set(columns: torch.Tensor, n: int) -> torch.Tensor:
+    """(B, ..., sets * n) -> (sets * B, ..., n): each set of n sectors by itself, its sectors evenly spaced."""
+    return torch.cat(columns.unflatten(-1, (n, -1)).unbind(-1))
 
 
-def _rolled(x: torch.Tensor, columns: int) -> torch.Tensor:
-    return torch.cat((x[..., columns:], x[..., :columns]), dim=-1)
-
-
-def _fourier_basis() -> torch.Tensor:
-    """(N_COLUMNS, 2 N_WAVES): cosines, then sines, of 1..N_WAVES turns around the ring, unit gain."""
-    turns = np.outer(np.arange(N_COLUMNS), np.arange(1, N_WAVES + 1)) * (2 * np.pi / N_COLUMNS)
-    return torch.from_numpy(np.concatenate((np.cos(turns), np.sin(turns)), axis=1) * (2 / N_COLUMNS)).float()
+def _spread(mean: torch.Tensor, square: torch.Tensor) -> torch.Tensor:
+    """Standard deviation from the means of x and of x squared, smooth at 0."""
+    return (square - mean * mean).clamp(min=1e-4).sqrt()

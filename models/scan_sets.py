@@ -5,8 +5,7 @@ Seeds of worlds keep the three sets apart: no world of validation or test is eve
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,8 +20,6 @@ from ..drivers.virtual.worlds import World, random_world
 from .overlap import RangeView, overlap_matrix, view_of_scan
 from .preprocess import Resampler
 
-log = logging.getLogger(__name__)
-
 FIRST_SEED = {"train": 1_000_000, "validation": 2_000_000, "test": 3_000_000}
 SCANS_PER_WORLD = 120
 SCENARIOS = ("quiet", "short", "demo")
@@ -36,9 +33,9 @@ OVERLAP_POINTS = 1024
 NEIGHBOURS = 3
 ON_ROUTE = 0.6
 EDGE_M = 12.0
-HEIGHT_M = (0.4, 2.3)
+HEIGHT_M = (0.4, 2.5)
 TILT_DEG = 1.5
-SPEED_M_S = 2.0
+SPEED_M_S = 8.0  # a street drive bends each scan by most of a metre
 TURN_RATE_DEG_S = 6.0
 ROTATION_S = 0.1
 
@@ -122,6 +119,11 @@ def along_route(world: World, rng: np.random.Generator, n: int) -> np.ndarray:
     return world.route.beside(rng.uniform(0, world.route.length_m, n), rng.normal(0, 0.8, n))
 
 
+def _one_or_the_other(world: World, rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 2) metres: half of the worlds are patrolled, the others roamed."""
+    return (along_route if rng.random() < 0.5 else anywhere)(world, rng, n)
+
+
 def _poses(world: World, rng: np.random.Generator, xy: np.ndarray) -> np.ndarray:
     """(n, 4, 4) T_world_sensor at (n, 2) metres, any yaw, one mounting height for all."""
     n = len(xy)
@@ -158,25 +160,22 @@ def scan_world(seed: int, n: int, beams: int, columns: int, places: Callable[...
     )
 
 
-def cached_worlds(folder: Path, role: str, count: int) -> Iterator[CachedWorld]:
-    """The first `count` worlds of a role; scans come from the folder's cache or are newly made into it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(FIRST_SEED[role], FIRST_SEED[role] + count):
-        path = folder / f"{seed}.npz"
-        if not path.exists():
-            _make(seed, path)
-            log.info("scanned %s world %d of %d", role, seed - FIRST_SEED[role] + 1, count)
-        with np.load(path) as stored:
-            fields = {name: stored[name] for name in stored.files}
-        overlap = fields.pop("overlap")
-        yield _through_sensors(WorldScans(**fields), overlap, seed)
+def cached_world(folder: Path, seed: int) -> CachedWorld:
+    """The world of a seed; its scans come from the folder's cache or are newly made into it."""
+    path = folder / f"{seed}.npz"
+    if not path.exists():
+        _make(seed, path)
+    with np.load(path) as stored:
+        fields = {name: stored[name] for name in stored.files}
+    overlap = fields.pop("overlap")
+    return _through_sensors(WorldScans(**fields), overlap, seed)
 
 
 def _make(seed: int, path: Path) -> None:
     """Scans a world and computes its overlaps into one file; a file of this name is always whole."""
     rng = np.random.default_rng((seed, 8))
     kinds, chances = zip(*SENSORS, strict=True)
-    scans = scan_world(seed, SCANS_PER_WORLD, *kinds[rng.choice(len(kinds), p=chances)])
+    scans = scan_world(seed, SCANS_PER_WORLD, *kinds[rng.choice(len(kinds), p=chances)], _one_or_the_other)
     unfinished = path.with_suffix(".tmp.npz")
     np.savez(unfinished, overlap=scans.overlaps(), **vars(scans))
     unfinished.replace(path)

@@ -9,28 +9,31 @@ from __future__ import annotations
 
 import argparse
 import logging
+import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from .batches import StatisticsOfWorld, draw_batch, statistics_of_worlds
+from .batches import FeaturesOfWorld, draw_batch, features_of_world
 from .export import write_model
 from .metrics import descriptor_distances, pairs, rank_agreement
 from .network import DescriptorNetwork
-from .scan_sets import cached_worlds
+from .scan_sets import FIRST_SEED, cached_world
 
 BATCH = 96
-PEAK_RATE = 1e-3
-WEIGHT_DECAY = 2e-2
-RANK_WEIGHT = 0.1
-# Differences of overlap below this are not worth ranking: they lie within the noise of the label.
-RANK_MARGIN = 0.03
-RANK_SHARPNESS = 20.0
+PEAK_RATE = 2e-3
+WEIGHT_DECAY = 5e-2
+ERROR_SCALE = 0.1  # of the overlap: smaller errors count by their square, larger ones linearly
+APART_WEIGHT = 0.15
+RANK_WEIGHT = 0.2
 CHECKPOINT_STEPS = 200
 THREADS = 1
+PROCESSES = 2  # that prepare worlds
 
 log = logging.getLogger(__name__)
 
@@ -43,11 +46,10 @@ class Trainer:
         self.out, self.seed, self.n_steps, self.step = out, seed, n_steps, 0
         self.network = DescriptorNetwork()
         self.optimizer = torch.optim.AdamW(self.network.parameters(), PEAK_RATE, weight_decay=WEIGHT_DECAY)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimizer, PEAK_RATE, n_steps, pct_start=0.1)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimizer, PEAK_RATE, n_steps, pct_start=0.15)
 
-    def train(self, worlds: list[StatisticsOfWorld], validation: list[StatisticsOfWorld]) -> None:
+    def train(self, worlds: list[FeaturesOfWorld], validation: list[FeaturesOfWorld]) -> None:
         """Runs to the last step, with a checkpoint and a line of the curve every CHECKPOINT_STEPS."""
-        self.network.standardise(torch.cat([world.statistics.flatten(0, 1) for world in worlds]).float())
         begun, losses = time.monotonic(), []
         while self.step < self.n_steps:
             losses.append(self._advance(worlds))
@@ -57,12 +59,12 @@ class Trainer:
                 self.save()
                 losses.clear()
 
-    def _advance(self, worlds: list[StatisticsOfWorld]) -> float:
+    def _advance(self, worlds: list[FeaturesOfWorld]) -> float:
         # Batch and dropout depend on seed and step alone: a resumed run does what an unbroken one does.
-        statistics, overlap = draw_batch(worlds, np.random.default_rng((self.seed, self.step)), BATCH)
+        scans, overlap = draw_batch(worlds, np.random.default_rng((self.seed, self.step)), BATCH)
         torch.manual_seed(self.seed * 1_000_003 + self.step)
         self.network.train()
-        loss = overlap_loss(self.network.head(statistics), overlap)
+        loss = overlap_loss(self.network(**scans), overlap)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
@@ -101,35 +103,53 @@ class Trainer:
 
 
 def overlap_loss(descriptors: torch.Tensor, overlap: torch.Tensor) -> torch.Tensor:
-    """Regression of the cosine on the overlap, plus ranking; (n, 256) unit vectors, (n, n) true overlaps.
+    """Regression of the cosine on the overlap, plus ranking; (W * n, 256) unit vectors, (W, n, n) true overlaps.
 
-    Cosine = overlap makes distance = sqrt(2 - 2 overlap), which falls with overlap over the whole range.
-    Rarer tenths of overlap weigh more, so that the many pairs that share little do not drown the others. The
-    ranking term asks, for each scan and each two others, that the one with more overlap be nearer.
+    Cosine = overlap makes distance = sqrt(2 - 2 overlap), which falls with overlap over the whole range; scans of two
+    worlds share nothing. The ranking term asks that distances correlate with the ranks of the overlaps, over all pairs
+    of the batch that are of one world: it is the benchmark's own figure, but for the ranks of the distances.
     """
     cosine = descriptors @ descriptors.T
-    upper = torch.triu_indices(len(overlap), len(overlap), 1)
-    flat_cosine, flat_overlap = cosine[upper[0], upper[1]], overlap[upper[0], upper[1]]
-    tenth = (flat_overlap * 10).long().clamp(max=9)
-    weight = torch.bincount(tenth, minlength=10).clamp(min=1).float().rsqrt()[tenth]
-    error = functional.smooth_l1_loss(flat_cosine, flat_overlap, reduction="none", beta=0.1)
-    regression = (weight * error).sum() / weight.sum()
-    gap = overlap[:, :, None] - overlap[:, None, :]
-    wrong_way = functional.softplus(RANK_SHARPNESS * (cosine[:, None, :] - cosine[:, :, None]))
-    # A scan beside itself ranks nothing.
-    counted = (gap > RANK_MARGIN) & ~torch.eye(len(overlap), dtype=torch.bool)[:, :, None]
-    ranking = (wrong_way * counted).sum() / (RANK_SHARPNESS * counted.sum().clamp(min=1))
-    return regression + RANK_WEIGHT * ranking
+    n_worlds, n, _ = overlap.shape
+    world = torch.arange(n_worlds).repeat_interleave(n)
+    one, other = torch.triu_indices(len(cosine), len(cosine), 1)
+    same = world[one] == world[other]
+    inside, across = cosine[one, other][same], cosine[one, other][~same]
+    wanted = torch.block_diag(*overlap)[one, other][same]
+    regression = functional.smooth_l1_loss(inside, wanted, beta=ERROR_SCALE)
+    # Places of two worlds may look alike: being nearer than chance is wrong, being farther is not.
+    apart = functional.smooth_l1_loss(across.clamp(min=0.0), torch.zeros_like(across), beta=ERROR_SCALE)
+    distance = torch.sqrt((2.0 - 2.0 * inside).clamp(min=1e-6))
+    rank = torch.argsort(torch.argsort(wanted)).float()
+    agreement = -torch.corrcoef(torch.stack((distance, rank)))[0, 1]
+    return regression + APART_WEIGHT * apart + RANK_WEIGHT * (1.0 - agreement)
+
+
+def prepare(folder: Path, role: str, count: int) -> list[FeaturesOfWorld]:
+    """The first worlds of a role; those that the folder does not hold are scanned into it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    seeds = range(FIRST_SEED[role], FIRST_SEED[role] + count)
+    worlds = []
+    with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
+        for world in pool.map(partial(_prepared, folder, role == "train"), seeds):
+            worlds.append(world)
+            log.info("%s world %d of %d", role, len(worlds), count)
+    return worlds
+
+
+def _prepared(folder: Path, spoilt: bool, seed: int) -> FeaturesOfWorld:
+    return features_of_world(cached_world(folder, seed), spoilt)
 
 
 @torch.no_grad()
-def validation_pairs(network: DescriptorNetwork, worlds: list[StatisticsOfWorld]) -> tuple[np.ndarray, np.ndarray]:
+def validation_pairs(network: DescriptorNetwork, worlds: list[FeaturesOfWorld]) -> tuple[np.ndarray, np.ndarray]:
     """Distances and overlaps of all pairs of each world, once through each sensor."""
     network.eval()
     distances, overlaps = [], []
     for world in worlds:
-        for statistics in world.statistics:
-            distances.append(pairs(descriptor_distances(network.head(statistics.float()).numpy())))
+        for variant in range(world.n_variants):
+            scans = world.take(variant, np.arange(len(world.overlap)))
+            distances.append(pairs(descriptor_distances(network(**scans).numpy())))
             overlaps.append(pairs(world.overlap.astype(np.float64)))
     return np.concatenate(distances), np.concatenate(overlaps)
 
@@ -143,16 +163,14 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of scans, checkpoint, curve and model")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--worlds", type=int, default=80, help="training worlds; a tenth more for validation")
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--worlds", type=int, default=60, help="training worlds; a fifth more for validation")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     torch.set_num_threads(THREADS)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    scans = arguments.out / "scans"
-    n_validation = max(arguments.worlds // 10, 2)
-    training = statistics_of_worlds(cached_worlds(scans, "train", arguments.worlds), spoilt=True)
-    validation = statistics_of_worlds(cached_worlds(scans, "validation", n_validation), spoilt=False)
+    training = prepare(arguments.out / "scans", "train", arguments.worlds)
+    validation = prepare(arguments.out / "scans", "validation", max(arguments.worlds // 5, 2))
     trainer = Trainer(arguments.out, arguments.seed, arguments.steps)
     trainer.resume()
     trainer.train(training, validation)
@@ -164,7 +182,9 @@ def main() -> None:
         overlap,
         data={
             "training_worlds": len(training),
+            "first_training_seed": FIRST_SEED["train"],
             "validation_worlds": len(validation),
+            "first_validation_seed": FIRST_SEED["validation"],
             "scans": sum(len(world.overlap) for world in training),
         },
         training={"seed": arguments.seed, "steps": arguments.steps, "batch": BATCH},

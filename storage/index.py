@@ -177,19 +177,18 @@ class IndexStore:
         with self.db.decoding():
             return np.array([row[0] for row in rows], np.int64), descriptor_array([row[1] for row in rows])
 
-    def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of all scans in scenes of some maps, described by this model: scene (N,), map (N,), descriptor (N, D)."""
+    def scene_descriptors(self, model_id: str, maps: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Of all scans in scenes of some maps, described by this model: scene (N,) int64, descriptor (N, D)."""
         maps = list(maps)
         rows = self.db.tuples(
-            f"""SELECT s.scene_id, s.map_id, d.descriptor
+            f"""SELECT s.scene_id, d.descriptor
                 FROM scenes AS s JOIN visits USING (scene_id) JOIN visit_scans USING (visit_id)
                      JOIN descriptors AS d USING (scan_id)
                 WHERE d.model_id = ? AND s.map_id IN ({", ".join("?" * len(maps))}) ORDER BY s.scene_id, scan_id""",
             (model_id, *maps),
         )
         with self.db.decoding():
-            scene, map_id = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
-            return scene, map_id, descriptor_array([row[2] for row in rows])
+            return np.array([row[0] for row in rows], np.int64), descriptor_array([row[1] for row in rows])
 
     def count_scans(self) -> int:
         """Key scans in the store."""

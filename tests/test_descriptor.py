@@ -5,10 +5,13 @@ import hashlib
 import json
 import shutil
 
+import captures
 import numpy as np
 import pytest
 import yard
+from click.testing import CliRunner
 
+from revisitd.daemon.cli import cli
 from revisitd.models.descriptor import DEFAULT_MODEL, DescriptorModel, ModelError
 
 # An ONNX file that maps (1, 1, 64, 900) to itself.
@@ -55,8 +58,22 @@ def test_turning_the_sensor_by_whole_output_columns_changes_nothing(model, cells
     assert np.abs(model.describe(scan, *geometry) - model.describe(turned, *geometry)).max() < 1e-5
 
 
+@pytest.mark.parametrize("sensor_columns", [1, 2, 3])
+def test_turning_the_sensor_by_part_of_an_output_column_changes_little(model, sensor_columns):
+    scan, geometry = yard.scan(128, 1024), yard.beams(128, 1024)
+    turned = np.roll(scan, sensor_columns, axis=1)
+    assert np.linalg.norm(model.describe(scan, *geometry) - model.describe(turned, *geometry)) < 0.05
+
+
 def test_turning_the_sensor_by_any_angle_changes_little(model):
     assert np.linalg.norm(describe(model, yaw=0.0) - describe(model, yaw=2.3456)) < 0.1
+
+
+def test_distance_grows_with_the_way_between_two_scans(model):
+    here = describe(model, x=-6.0)
+    ways_m = (0.3, 1.0, 3.0, 8.0)
+    distances = [np.linalg.norm(here - describe(model, x=-6.0 + way)) for way in ways_m]
+    assert distances == sorted(distances)
 
 
 def test_scans_of_two_sensors_in_one_program_do_not_mix(model):
@@ -88,8 +105,21 @@ def test_an_overlap_and_its_distance_belong_together(model):
 def test_a_model_of_another_shape_is_refused(copied):
     copied.write_bytes(OTHER_MODEL)
     change_card(copied, sha256=hashlib.sha256(OTHER_MODEL).hexdigest())
-    with pytest.raises(ModelError, match=r"maps \[\[1, 1, 64, 900\]\].*want \[\[1, 3, 32, 256\]\] to \[\[1, 256\]\]"):
+    with pytest.raises(ModelError, match=r"maps .*\[1, 1, 64, 900\].*want .*\[1, 8, 24, 256\].* to \[\[1, 256\]\]"):
         DescriptorModel.load(copied)
+
+
+def test_a_run_with_a_model_of_another_shape_ends_at_its_start(copied, tmp_path, monkeypatch):
+    """With the exit code for the model and one line, before a frame is read."""
+    copied.write_bytes(OTHER_MODEL)
+    change_card(copied, sha256=hashlib.sha256(OTHER_MODEL).hexdigest())
+    monkeypatch.setattr("revisitd.models.descriptor.DEFAULT_MODEL", copied)
+    document = captures.metadata()
+    capture = captures.write_capture(tmp_path, document, captures.packets(document, range(3)))
+    result = CliRunner().invoke(cli, ["replay", str(capture), "--data", str(tmp_path / "data")])
+    assert result.exit_code == 78
+    (line,) = result.output.splitlines()
+    assert line.startswith(f"Error: model {copied} maps")
 
 
 def test_a_card_of_another_model_is_refused(copied):

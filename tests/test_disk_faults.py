@@ -201,7 +201,7 @@ def test_visits_that_end_while_the_index_is_locked_are_recorded_after(store):
 
 def test_what_was_found_waits_until_changes_db_is_free(store, monkeypatch):
     monkeypatch.setattr("revisitd.daemon.instances.RETRY_S", 0.0)
-    detection = ChangeDetection(Config(), store, process=None, model_id="feedc0ffee00")
+    detection = ChangeDetection(Config(), store, process=None, model=None)
     attempts = []
 
     def record():
@@ -214,7 +214,7 @@ def test_what_was_found_waits_until_changes_db_is_free(store, monkeypatch):
 
 
 def test_a_program_that_ends_does_not_wait_for_changes_db(store):
-    detection = ChangeDetection(Config(), store, process=None, model_id="feedc0ffee00")
+    detection = ChangeDetection(Config(), store, process=None, model=None)
     detection.hurry.set()
 
     def record():

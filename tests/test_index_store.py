@@ -141,13 +141,13 @@ def test_a_map_that_was_given_up_for_an_older_one_is_not_joined_again(index, ses
     assert index.sessions()[-1].session_id == joined
 
 
-def test_descriptors_come_with_the_scenes_and_maps_of_their_scans(index, session):
+def test_descriptors_come_with_the_scenes_of_their_scans(index, session):
     other = index.start_session(**SESSION)
     for scene, map_id, scan_ids in ((1, session, [1, 2]), (2, other, [3])):
         index.add_scene(scene, map_id, np.array([[0.0, 0.0]]), 2.5, 20.0)
         add_visit(index, scene, 1, map_id, scan_ids)
-    scene, map_id, descriptors = index.scene_descriptors("feedc0ffee00", [session, other])
-    assert (scene.tolist(), map_id.tolist()) == ([1, 1, 2], [session, session, other])
+    scene, descriptors = index.scene_descriptors("feedc0ffee00", [session, other])
+    assert scene.tolist() == [1, 1, 2]
     np.testing.assert_array_equal(descriptors, [make_scan(i).descriptor for i in (1, 2, 3)])
     assert index.scene_descriptors("feedc0ffee00", [other])[0].tolist() == [2]
     assert len(index.scene_descriptors("another model", [session, other])[0]) == 0

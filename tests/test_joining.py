@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -109,6 +111,18 @@ def test_what_changed_overnight_is_found_against_the_first_days_scans(today, day
         assert np.linalg.norm(match.centroid - place) < 0.5
         assert (match.session, match.visit, match.last_before_session) == (3, 2, 1)
         assert match.first_seen_ns in second and match.last_before_ns in first
+
+
+def test_a_map_that_another_model_described_is_joined_too(yesterday, days, tmp_path):
+    """Its scans look like nothing that today's model knows; where they are is tried all the same."""
+    data = tmp_path / "data"
+    shutil.copytree(yesterday, data)
+    with closing(sqlite3.connect(data / "index.db")) as db, db:
+        db.execute("UPDATE descriptors SET model_id = 'feedc0ffee00', descriptor = zeroblob(1024)")
+    run(days[1], data)
+    with Store.open_reader(data) as store:
+        assert [(row.map_id, row.continues) for row in store.index.sessions()][-1] == (1, 2)
+        assert store.index.db.value("SELECT status FROM instances") == "done"
 
 
 def test_a_session_in_another_world_makes_a_map_of_its_own(yesterday, tmp_path):

@@ -14,8 +14,8 @@ OTHER = -SAME
 class Walk:
     """Feeds a tracker with key scans every half metre, 0.25 s apart."""
 
-    def __init__(self, **settings):
-        self.tracker = SceneTracker(SceneConfig(**settings), [], 1)
+    def __init__(self, beta=1.2, **settings):
+        self.tracker = SceneTracker(SceneConfig(**settings), beta, [], 1)
         self.scan_id = 0
         self.scenes, self.ended = [], []
 

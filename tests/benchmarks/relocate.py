@@ -56,7 +56,7 @@ def relocate(source: Path, into: Path, config: Config) -> np.ndarray:
     with Store.open_writer(into) as store:
         shutil.copytree(source / "sensors", into / "sensors", dirs_exist_ok=True)
         sensors, model, motions = Sensors(store.dir), DescriptorModel.load(), {}
-        detection = ChangeDetection(config, store, InProcess(into), model.model_id)
+        detection = ChangeDetection(config, store, InProcess(into), model)
         worker = DetectionWorker(detection.run, config.worker.queue_size)
         with mock.patch("revisitd.daemon.session.Odometry", lambda _: StoredOdometry(motions)):
             pipeline = Pipeline(config, store, sensors, model, worker, lambda _: None, str(source), wait=True)

@@ -13,6 +13,7 @@ from revisitd.daemon.instances import ChangeDetection
 from revisitd.daemon.scenes import SceneTracker
 from revisitd.daemon.session import Session
 from revisitd.daemon.worker import Instance
+from revisitd.models.descriptor import DescriptorModel
 from revisitd.storage.store import Store
 
 VISITS = """
@@ -53,8 +54,10 @@ def find_scenes_again(data: Path, config: Config) -> None:
             db.execute(f"DELETE FROM {table}")
     with Store.open_writer(data) as store:
         path = store.index.trajectory()
-        _, descriptors = store.index.all_descriptors(model_of(store))
-        tracker = SceneTracker(config.scenes, [], store.index.next_scene_id())
+        model = model_of(store)
+        _, descriptors = store.index.all_descriptors(model.model_id)
+        beta = float(model.distance_from_overlap(config.scenes.min_overlap))
+        tracker = SceneTracker(config.scenes, beta, [], store.index.next_scene_id())
         session = _recorder(store, config)
         for i in range(len(path.scan_id)):
             xy = path.T_map_sensor[i, :2, 3]
@@ -75,9 +78,12 @@ def instances_of(store: Store) -> list[Instance]:
     return [Instance(*row) for row in store.index.db.tuples(VISITS)]
 
 
-def model_of(store: Store) -> str:
-    """The id of the model that described the scans."""
-    return store.index.db.value("SELECT model_id FROM descriptors LIMIT 1")
+def model_of(store: Store) -> DescriptorModel:
+    """The model, which must be the one that described the scans: the calibration of no other fits their distances."""
+    model, described_by = DescriptorModel.load(), store.index.db.value("SELECT model_id FROM descriptors LIMIT 1")
+    if described_by != model.model_id:
+        raise SystemExit(f"{store.dir.path} was described by model {described_by}, this is {model.model_id}: replay it")
+    return model
 
 
 def detection_on(store: Store, config: Config) -> ChangeDetection:
