@@ -121,7 +121,8 @@ def test_a_step_of_the_clock_ends_the_session_and_begins_another(monkeypatch):
     monkeypatch.setattr(pipeline, "Session", start)
     store = MagicMock()
     store.index.maps_to_join.return_value = []
-    line = pipeline.Pipeline(Config(), store, None, None, None, None, "os1", wait=False)
+    model = MagicMock(**{"distance_from_overlap.return_value": 1.0})
+    line = pipeline.Pipeline(Config(), store, None, model, None, None, "os1", wait=False)
     for one in [frame(0), frame(1), *(frame(index, step_ns=37 * NS) for index in range(2, 6))]:
         line.process(one)
     first, second = ([call.args[0].frame_id for call in s.odometry.register.call_args_list] for s in sessions)
