@@ -115,7 +115,7 @@ def test_it_waits_for_its_sensor_follows_it_and_stops_in_order(start, capture, t
     until(lambda: status_of(data)["place"]["key_scans"] > 2, "key scans")
     shown = status_of(data)
     assert (shown["sensor"]["phase"], shown["sensor"]["mode"]) == ("running", "512x10")
-    assert shown["place"]["session_id"] == 1 and shown["store"]["free_bytes"] > 0
+    assert shown["place"]["session_id"] and shown["store"]["free_bytes"] > 0
     until(lambda: daemon.told.count("WATCHDOG=1") > 2, "the watchdog is fed")
     assert "revisitd_frames_total" in (data / "revisitd.prom").read_text()
 
