@@ -27,10 +27,13 @@ RELOADED = ("detection", "storage")  # sections that take effect without a resta
 
 
 class Service:
-    """What `revisitd run` runs. config_path: where the settings are read again at SIGHUP; None: there are none."""
+    """What `revisitd run` runs.
 
-    def __init__(self, data: Path, config: Config, config_path: Path | None):
-        self._data, self._config, self._config_path = data, config, config_path
+    address: the sensor's. config_path: where the settings are read again at SIGHUP; None: there are none.
+    """
+
+    def __init__(self, data: Path, address: str, config: Config, config_path: Path | None):
+        self._data, self._address, self._config, self._config_path = data, address, config, config_path
         self._stop, self._reload = threading.Event(), threading.Event()
 
     def run(self) -> None:
@@ -38,12 +41,11 @@ class Service:
         faulthandler.enable()  # the watchdog's SIGABRT: the journal shows what each thread was at
         self._listen_to_signals()
         notify("STATUS=opening the store")
-        address = self._config.sensor.address
-        with Program(self._data, self._config, address, wait=False) as program:
-            source = KeptSource(address, self._config.sensor.wish, self._stop)
-            board = StatusBoard(self._data, program, source, address)
+        with Program(self._data, self._config, self._address, wait=False) as program:
+            source = KeptSource(self._address, self._config.sensor.wish, self._stop)
+            board = StatusBoard(self._data, program, source, self._address)
             notify("READY=1")
-            logger.info("revisitd serves %s, data in %s", address, self._data)
+            logger.info("revisitd serves %s, data in %s", self._address, self._data)
             self._loop(program, source, board)
             notify("STOPPING=1", "STATUS=stopping: the instance at hand may finish")
             program.stop(STOP_S)
@@ -102,8 +104,9 @@ class _Watchdog:
         self._fed = 0.0
 
     def turn(self) -> None:
+        """Once for each turn of the frame loop."""
         now = time.monotonic()
-        if self._interval_s is None or now - self._fed < self._interval_s / 2:
+        if self._interval_s is None or now - self._fed < self._interval_s:
             return
         if self._program.worker.busy_s > self.GRACE * self._timeout_s:
             logger.error("the detection is stuck for %.0f s: the watchdog is not fed", self._program.worker.busy_s)

@@ -15,7 +15,8 @@ while IFS= read -r site; do
     number=$((number + 1))
     mkdir /opt/sites/$number
     mount --bind "$site" /opt/sites/$number
-    echo /opt/sites/$number >> "$(echo /opt/revisitd/lib/python3*/site-packages)/tests.pth"
+    # By addsitedir, which follows the .pth files in there: an editable installation is one.
+    echo "import site; site.addsitedir('/opt/sites/$number')" >> "$(echo /opt/revisitd/lib/python3*/site-packages)/tests.pth"
 done <<< "$SITES"
 cat > /opt/revisitd/bin/revisitd <<'END'
 #!/opt/revisitd/bin/python

@@ -37,15 +37,14 @@ def run(source: str | None, data: Path | None, config_path: Path | None) -> None
     from ..service import Service
 
     config = load_config(config_path)
-    if source:
-        config = config.model_copy(update={"sensor": config.sensor.model_copy(update={"address": source})})
-    if not config.sensor.address:
+    address = source or config.sensor.address
+    if not address:
         raise ConfigError(f"{config_path or 'settings'}: sensor.address is empty: give the sensor's, or --source")
     state = os.environ.get("STATE_DIRECTORY")
     if data is None and state is None:
         raise click.UsageError("give the data directory with --data")
     logging.getLogger().setLevel(min(logging.getLogger().level, logging.INFO))
-    Service(data or Path(state), config, config_path).run()
+    Service(data or Path(state), address, config, config_path).run()
 
 
 @click.command()
