@@ -10,6 +10,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..drivers.kept import KeptSource
+from .memory import resident_bytes
 from .metrics import METRICS_FILE, write_metrics
 from .notify import notify
 from .pipeline import Now
@@ -30,7 +31,6 @@ logger = logging.getLogger(__name__)
 EVERY_S = 1.0
 RATE_S = 10.0  # over which the frame rate and the losses are told
 SLOW = 0.8  # of the sensor's rate: less is worth a word
-PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 class StatusBoard:
@@ -161,8 +161,8 @@ class StatusBoard:
             repairs=tuple(self._program.store.repairs),
             scans=figures.scans,
             scans_deleted=figures.scans_deleted,
-            memory_bytes=_resident_bytes("self"),
-            detection_memory_bytes=_resident_bytes(self._program.process.pid),
+            memory_bytes=resident_bytes("self"),
+            detection_memory_bytes=resident_bytes(self._program.process.pid),
         )
 
 
@@ -187,10 +187,3 @@ def _line(
     if problem:
         return "degraded", f"{problem}, {figures}"
     return "running", f"good {figures}"
-
-
-def _resident_bytes(pid: int | str) -> int:
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE_BYTES
-    except (OSError, IndexError):  # it has just died
-        return 0

@@ -128,6 +128,7 @@ def _serve(connection: Connection, data: Path) -> None:
                 answer = relocator.locate(job)
             else:
                 if relocator is not None and time.monotonic() - asked_s > KEEP_PLACES_S:
+                    relocator.close()
                     relocator = None
                 comparer = comparer or Comparer(data)
                 answer = comparer.compare(job)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
 from ..models.descriptor import DescriptorModel
+from ..storage.errors import StorageUnavailable
 from ..storage.store import Store
 from .config import Config, dump_config
 from .detection_process import DetectionProcess
@@ -15,6 +17,8 @@ from .instances import ChangeDetection
 from .pipeline import Pipeline
 from .sensors import Sensors
 from .worker import DetectionWorker
+
+logger = logging.getLogger(__name__)
 
 
 class Program:
@@ -28,7 +32,10 @@ class Program:
     def __init__(self, data: Path, config: Config, source: str, wait: bool):
         with ExitStack() as opened:
             self.store = opened.enter_context(Store.open_writer(data))
-            (data / "config.toml").write_text(dump_config(config), encoding="utf-8")
+            try:
+                self.store.dir.put_settings(dump_config(config))
+            except StorageUnavailable as why:  # a robot drives on without it, and the retention may free the disk
+                logger.warning("this run's settings are not kept: %s", why)
             self.model = DescriptorModel.load()
             self.process = DetectionProcess(self.store.dir.path, config.worker.timeout_s)
             opened.callback(self.process.close)

@@ -94,6 +94,12 @@ class Relocator:
         answers = [verdict(map_id, matches[map_id], self._alignment.max_residual_m) for map_id in maps]
         return next((answer for answer in answers if not answer.reason), answers[0])
 
+    def close(self) -> None:
+        """Forget all places now: a cache of one's own methods is a circle, which Python breaks when it likes."""
+        self._place.cache_clear()
+        self._surface.cache_clear()
+        self._store.close()
+
     def _places_like(self, descriptor: np.ndarray, model_id: str, maps: list[int]) -> list[Place]:
         """The scenes of these maps whose scans lie nearest by descriptor; last, those that another model described."""
         index = self._store.index

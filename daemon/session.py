@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from .. import __version__
 from ..drivers.frame import Sensor
 from ..storage.store import Store
-from .config import Config, dump_config
+from .config import AlignmentConfig, Config, dump_config
 from .hull import grown_area_m2
 from .joining import Join
 from .keyscans import KeyScanRule
@@ -64,7 +65,12 @@ class Session:
         self.odometry = continues.odometry if continues else Odometry(config.odometry)
         self.key_scans = continues.key_scans if continues else KeyScanRule(config.keyscans)
         T_map_odom = join.T_map_odom if join else np.eye(4)
-        self.localizer = Localizer(config.alignment, self._load_reference, T_map_odom)
+        self.localizer = Localizer(
+            # Not a method of ours: session and localizer would hold each other, and 40 MB of maps with them.
+            config.alignment,
+            partial(_reference, store, sensors, config.alignment),
+            T_map_odom,
+        )
         known = [Scene(row.scene_id, row.hull, row.n_visits) for row in store.index.scenes(self.map_id)]
         self._unrecorded: list[SceneUpdate] = []  # what the disk has not taken yet
         self.scenes = SceneTracker(config.scenes, beta, known, store.index.next_scene_id())
@@ -117,7 +123,8 @@ class Session:
                 )
         return due
 
-    def _load_reference(self, scene: Scene) -> Iterator[Moments]:
-        """The cells of the scene's first visit, one scan after another, in the map."""
-        first_visit = self._store.index.scans_of_scene(scene.scene_id, visit=1)
-        return reference_cells(first_visit, self._store.scans, self._sensors, self._config.alignment)
+
+def _reference(store: Store, sensors: Sensors, config: AlignmentConfig, scene: Scene) -> Iterator[Moments]:
+    """The cells of a scene's first visit, one scan after another, in the map."""
+    first_visit = store.index.scans_of_scene(scene.scene_id, visit=1)
+    return reference_cells(first_visit, store.scans, sensors, config)

@@ -55,7 +55,7 @@ class SensorHttp:
         if not _is_success(status):
             raise SensorUnavailable(
                 f"http://{self.address}/{path} answers {status} {responses.get(status, '')}: "
-                "no Ouster sensor, or firmware before 3.1"
+                "no Ouster sensor, or one whose firmware must be updated to 3.1 or newer"
             )
         try:
             answer = json.loads(text)

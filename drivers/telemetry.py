@@ -1,4 +1,4 @@
-"""What a sensor says of its own health: temperature, voltage, alerts, and whether its clock follows another."""
+"""What a sensor says of its own health: temperature, alerts, and whether its clock follows another."""
 
 import threading
 import time
@@ -18,7 +18,6 @@ class Telemetry:
 
     host_ns: int
     temperature_c: float | None
-    input_voltage_v: float | None
     alerts: tuple[str, ...]  # active ones: "WARNING 0x01000015: ..."
     clock_synced: bool | None  # to PTP or its sync pulse; None with the internal oscillator
 
@@ -29,8 +28,7 @@ def read_telemetry(sensor: SensorHttp) -> Telemetry:
     active = alerts.get("active")
     return Telemetry(
         host_ns=time.time_ns(),
-        temperature_c=_number(telemetry.get("internal_temperature_deg_c"), 1.0),
-        input_voltage_v=_number(telemetry.get("input_voltage_mv"), 1e-3),
+        temperature_c=_number(telemetry.get("internal_temperature_deg_c")),
         alerts=tuple(_alert(alert) for alert in active[:MOST_ALERTS]) if isinstance(active, list) else (),
         clock_synced=_is_synced(clock),
     )
@@ -62,8 +60,8 @@ def _ask(sensor: SensorHttp, path: str) -> dict:
         return {}
 
 
-def _number(value: object, unit: float) -> float | None:
-    return round(value * unit, 3) if isinstance(value, (int, float)) else None
+def _number(value: object) -> float | None:
+    return value if isinstance(value, (int, float)) else None
 
 
 def _alert(alert: object) -> str:

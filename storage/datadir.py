@@ -59,7 +59,7 @@ class DataDir:
                 _write_identity(path)
             identity = _read_identity(path)
             make_dir(path / "sensors")
-            for leftover in (path / "sensors").glob("*.json.*"):  # half-written when a process was killed
+            for leftover in (path / "sensors").glob("*.*.*"):  # half-written when a process was killed
                 leftover.unlink()
         except BaseException:
             lock.close()
@@ -105,6 +105,12 @@ class DataDir:
         if not path.exists():
             with naming(path):
                 write_atomically(path, metadata.encode(), path.parent)
+
+    def put_settings(self, text: str) -> None:
+        """Keep the settings of the run that begins, for people: config.toml. Raises StorageUnavailable, OSError."""
+        path = self.path / "config.toml"
+        with naming(path):
+            write_atomically(path, text.encode(), self.path / "sensors")
 
     def has_sensor(self, digest: str) -> bool:
         """Whether a sensor's metadata is kept."""

@@ -90,6 +90,16 @@ def test_a_store_on_a_full_disk_opens(small_disk):
         assert store.index.trajectory().scan_id.tolist() == ids
 
 
+def test_on_a_full_disk_the_settings_of_the_run_before_stay_whole(small_disk):
+    with Store.open_writer(small_disk / "data") as store:
+        store.dir.put_settings("[detection]\n")
+        fill(small_disk)
+        with pytest.raises(StorageFull, match="config.toml: no space left: free some"):
+            store.dir.put_settings("# as long as a real one\n" * 1000)
+        assert (small_disk / "data/config.toml").read_text() == "[detection]\n"
+        assert list((small_disk / "data/sensors").iterdir()) == []
+
+
 @pytest.mark.parametrize("leave", range(0, 80_000, 8192))
 def test_a_write_that_fails_at_any_depth_leaves_nothing_of_itself(small_disk, leave):
     with Store.open_writer(small_disk / "data") as store:

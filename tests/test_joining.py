@@ -1,5 +1,6 @@
 """A robot that was switched off and on again: its new session is joined to the map it made before."""
 
+import gc
 import json
 import shutil
 import sqlite3
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from revisitd.daemon.config import Config
 from revisitd.daemon.progress import summary_text
+from revisitd.daemon.relocalization import Place, Question, Relocator
 from revisitd.daemon.replay import replay
 from revisitd.storage.store import Store
 
@@ -136,3 +138,22 @@ def test_a_session_in_another_world_makes_a_map_of_its_own(yesterday, tmp_path):
         assert [row.map_id for row in store.index.sessions()] == [1, 2]
         assert store.index.maps_to_join() == [1, 2]
     assert "not joined to an earlier map (2 attempts)" in summary_text(summary)
+
+
+def test_a_relocator_that_is_closed_forgets_its_places_at_once(yesterday):
+    """Not when Python's collector comes by: it counts objects, not their megabytes."""
+    alignment = Config().alignment
+    relocator = Relocator(yesterday, alignment)
+    gc.disable()
+    try:
+        relocator.locate(Question(1, 1, [1], alignment))
+        assert n_alive(Place) == 1
+        relocator.close()
+        assert n_alive(Place) == 0
+    finally:
+        gc.enable()
+
+
+def n_alive(kind):
+    """How many objects of a type there are, garbage included."""
+    return sum(type(thing) is kind for thing in gc.get_objects())

@@ -1,5 +1,7 @@
 """What goes wrong on a drive: noticed, counted, a session closed where it must be, and never a false change."""
 
+import gc
+import weakref
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -146,3 +148,17 @@ def test_a_scene_that_the_disk_did_not_take_is_recorded_with_the_next_key_scan(t
         monkeypatch.setattr(program.store.index, "add_scene", add_scene)
     with Program(tmp_path / "data", Config(), "test", wait=True) as again:
         assert len(again.store.index.scenes()) == 1
+
+
+def test_a_session_that_has_ended_leaves_memory_at_once(tmp_path, drive):
+    """Not when Python's collector comes by: it counts objects, not their megabytes."""
+    with running(tmp_path) as program:
+        gc.disable()
+        try:
+            program.pipeline.process(drive[0])
+            session = weakref.ref(program.pipeline._session)
+            program.pipeline.process(drive[1])
+            program.pipeline.finish()
+            assert session() is None
+        finally:
+            gc.enable()

@@ -27,6 +27,7 @@ from revisitd.drivers import virtual
 
 EVERY_S = 5.0
 HTTP_PORT = 8095
+WARM_UP_S = 300.0  # after a start: imports, compiled loops, caches
 RESTART_S = 5.0  # as the unit's RestartSec
 PROGRAM = "from revisitd.daemon.cli import main\nif __name__ == '__main__':\n    main()\n"
 # What happens, how often an hour, and what the emulator is told; None: the daemon is killed.
@@ -135,15 +136,34 @@ class Soak:
             return subprocess.Popen([sys.executable, self._program, *map(str, arguments)], stdout=out, stderr=out)
 
 
+def slope_within_runs(samples: list[dict], t_h: np.ndarray, mib: np.ndarray) -> float:
+    """MiB an hour that all runs of the daemon have in common, each without its first minutes; NaN for short ones."""
+    pid = np.array([sample["pid"] for sample in samples])
+    along = above = 0.0
+    for run in np.unique(pid):
+        t, m = t_h[pid == run], mib[pid == run]
+        warm = t > t[0] + WARM_UP_S / 3600
+        if warm.any():
+            t, m = t[warm] - t[warm].mean(), m[warm] - m[warm].mean()
+            along, above = along + t @ t, above + t @ m
+    return above / along if along else float("nan")
+
+
+def over_restarts(samples: list[dict], counts: list[int]) -> np.ndarray:
+    """A counter that each run of the daemon begins at zero, as one that goes on."""
+    steps = np.diff(counts, prepend=0)
+    begun = np.diff([sample["pid"] for sample in samples], prepend=0) != 0
+    return np.cumsum(np.where(begun, counts, steps))
+
+
 def report(soak: Soak, quota_gb: float) -> str:
     """The figures, for people."""
     samples = soak.samples
     t_h = np.array([sample["t_s"] for sample in samples]) / 3600
-    late = t_h > t_h[-1] / 3  # its caches are full by then
     lines = [f"{t_h[-1] * 60:.0f} minutes, {len(soak.faults)} faults, {soak.restarts} restarts"]
     for name in ("memory_bytes", "detection_memory_bytes"):
         mib = np.array([sample["store"][name] for sample in samples]) / 2**20
-        slope, _ = np.polyfit(t_h[late], mib[late], 1)
+        slope = slope_within_runs(samples, t_h, mib)
         lines.append(f"{name}: median {np.median(mib):.0f} MiB, most {mib.max():.0f} MiB, slope {slope:+.1f} MiB/h")
     used = np.array([sample["store"]["used_bytes"] for sample in samples]) / 1e9
     lines.append(f"disk: most {used.max():.3f} GB of {quota_gb:g} GB; {samples[-1]['store']['scans']} scans at the end")
@@ -167,25 +187,30 @@ def report(soak: Soak, quota_gb: float) -> str:
 
 
 def plot(soak: Soak, path: Path) -> None:
-    """Memory, disk, frame rate and faults over time."""
+    """Memory, disk, instances and losses, frame rate, faults and restarts over time."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     t_min = [sample["t_s"] / 60 for sample in soak.samples]
-    figure, axes = pyplot.subplots(3, 1, figsize=(10, 8), sharex=True, layout="constrained")
+    figure, axes = pyplot.subplots(4, 1, figsize=(10, 10), sharex=True, layout="constrained")
     for name, label in (("memory_bytes", "main process"), ("detection_memory_bytes", "detection process")):
         axes[0].plot(t_min, [sample["store"][name] / 2**20 for sample in soak.samples], label=label)
     axes[0].set_ylabel("memory, MiB")
     axes[1].plot(t_min, [sample["store"]["used_bytes"] / 1e9 for sample in soak.samples], label="data directory")
     axes[1].plot(t_min, [sample["store"]["quota_bytes"] / 1e9 for sample in soak.samples], "--", label="quota")
     axes[1].set_ylabel("disk, GB")
-    axes[2].plot(t_min, [sample["frames"]["hz"] for sample in soak.samples], label="frames, Hz")
+    done = [sample["detection"]["done"] for sample in soak.samples]
+    axes[2].plot(t_min, over_restarts(soak.samples, done), label="instances done")
+    lost = [sample["frames"]["losses"].get("frames missing", 0) for sample in soak.samples]
+    axes[2].plot(t_min, over_restarts(soak.samples, lost), label="frames missing")
+    axes[2].set_ylabel("since the start")
+    axes[3].plot(t_min, [sample["frames"]["hz"] for sample in soak.samples], label="frames, Hz")
     for at_s, name in soak.faults:
-        axes[2].axvline(at_s / 60, color="tab:red", alpha=0.3, lw=1)
-        axes[2].text(at_s / 60, 0.2, name, rotation=90, fontsize=6, va="bottom")
-    axes[2].set(ylabel="frame rate, Hz", xlabel="minutes")
+        axes[3].axvline(at_s / 60, color="tab:red", alpha=0.3, lw=1)
+        axes[3].text(at_s / 60, 0.2, name, rotation=90, fontsize=6, va="bottom")
+    axes[3].set(ylabel="frame rate, Hz", xlabel="minutes")
     for axis in axes:
         axis.legend(loc="upper right")
         axis.set_ylim(bottom=0)
