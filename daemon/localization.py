@@ -15,7 +15,7 @@ from .odometry import Motion
 from .reference_map import COARSE_VOXEL_M, ReferenceMap
 from .registration import align, scan_cloud
 from .scenes import Scene
-from .sweep import Sweep
+from .sweep import STEADY, Sweep
 from .sweep_fit import SweepFit, fit_sweep
 from .voxels import Moments
 
@@ -27,13 +27,14 @@ MIN_COARSE_TRAVEL_M = 5.0  # metres without a fix after which a large drift is l
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """Where a key scan was: T_map_sensor (4, 4) at its end, T_start_end (4, 4) the sensor's motion during it.
+    """Where a key scan was: T_map_sensor (4, 4) at the end of the steady motion T_start_end (4, 4) nearest to its own.
 
-    aligned says whether a stored scene confirmed it.
+    bend (6,): how far it was off that, see Sweep; aligned says whether a stored scene confirmed it.
     """
 
     T_map_sensor: np.ndarray
     T_start_end: np.ndarray
+    bend: np.ndarray
     aligned: bool
     residual_m: float  # root mean square distance to the reference's surface; NaN without a reference
     reason: str
@@ -75,7 +76,7 @@ class Localizer:
         """
         self._travel(motion.T_odom_sensor)
         fix = self._fix(sweep, self.predict(motion.T_odom_sensor), motion.T_start_end, scenes)
-        self._local_map.add(sweep.in_map(fix.T_map_sensor, fix.T_start_end))
+        self._local_map.add(sweep.in_map(fix.T_map_sensor, fix.T_start_end, fix.bend))
         self.T_map_odom = fix.T_map_sensor @ inverse(motion.T_odom_sensor)
         return fix
 
@@ -106,10 +107,11 @@ class Localizer:
                 self._travel_since_fix_m = 0.0
                 if np.linalg.norm(fit.T_map_sensor[:3, 3] - predicted[:3, 3]) > MAX_SEAM_M:
                     self._local_map.clear()
-                return Fix(fit.T_map_sensor, fit.T_start_end, True, fit.residual_m, "")
+                return Fix(fit.T_map_sensor, fit.T_start_end, fit.bend, True, fit.residual_m, "")
         fit = self._local_map.refine(sweep, predicted, T_start_end)
-        pose, motion = (fit.T_map_sensor, fit.T_start_end) if fit is not None else (predicted, T_start_end)
-        return Fix(pose, motion, False, float("nan"), reason)
+        if fit is None:
+            return Fix(predicted, T_start_end, STEADY, False, float("nan"), reason)
+        return Fix(fit.T_map_sensor, fit.T_start_end, fit.bend, False, float("nan"), reason)
 
     def _travel(self, T_odom_sensor: np.ndarray) -> None:
         position = T_odom_sensor[:3, 3].copy()

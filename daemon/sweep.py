@@ -13,6 +13,7 @@ from .geometry import column_phase, inverse
 from .views import OWN_BODY_M
 from .voxels import Moments, moments_of, voxel_keys
 
+STEADY = np.zeros(6)
 MAX_CELLS = 20_000  # an OS1-128 in a street fills 12 thousand; rain or leaves all around do not stop the registration
 
 
@@ -27,19 +28,28 @@ class Sweep:
     cells: Moments
     phase: np.ndarray
 
-    def at_end(self, T_start_end: np.ndarray) -> np.ndarray:
-        """The cells' means (N, 3) in the sensor frame at the sweep's end, for a motion (4, 4) during the sweep."""
+    @property
+    def bow(self) -> np.ndarray:
+        """(N,): the lowest shape of an unsteady motion, a parabola over the sweep; no steady motion resembles it."""
+        return 6.0 * self.phase * (1.0 - self.phase) - 1.0
+
+    def at_end(self, T_start_end: np.ndarray, bend: np.ndarray = STEADY) -> np.ndarray:
+        """The cells' means (N, 3) in the sensor frame at the end of a steady motion (4, 4).
+
+        bend (6,): how far the sensor was off it, metres and a rotation vector, times bow.
+        """
         T_end_start = inverse(T_start_end)
         # As in deskew(): rotation vector and translation are scaled apart.
         turned = Rotation.from_rotvec(self.phase[:, None] * Rotation.from_matrix(T_start_end[:3, :3]).as_rotvec())
         at_start = turned.apply(self.cells.mean) + self.phase[:, None] * T_start_end[:3, 3]
-        return at_start @ T_end_start[:3, :3].T + T_end_start[:3, 3]
+        at_end = at_start @ T_end_start[:3, :3].T + T_end_start[:3, 3]
+        return at_end + self.bow[:, None] * (bend[:3] + np.cross(bend[3:], at_end))
 
-    def in_map(self, T_map_sensor: np.ndarray, T_start_end: np.ndarray) -> Moments:
-        """The cells in the map, for a pose at the sweep's end and a motion during it, (4, 4) each."""
+    def in_map(self, T_map_sensor: np.ndarray, T_start_end: np.ndarray, bend: np.ndarray = STEADY) -> Moments:
+        """The cells in the map, for a pose at the end of a steady motion, (4, 4) each, and how far it was off that."""
         R = T_map_sensor[:3, :3]
         # A cell's spread turns with the sweep by some degrees at most: nothing beside its cell's size.
-        mean = self.at_end(T_start_end) @ R.T + T_map_sensor[:3, 3]
+        mean = self.at_end(T_start_end, bend) @ R.T + T_map_sensor[:3, 3]
         return Moments(self.cells.count, mean, R @ self.cells.covariance @ R.T)
 
 

@@ -1,13 +1,30 @@
 """What must not be reported: one test for each cause of false changes, on worlds in which nothing changed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("revisitd.drivers.virtual.embree", reason="needs the extra [sim]", exc_type=ImportError)
 
 import staged
-from staged import OS1_32, OS1_64, OS1_128, Thing, Visit, compare, driver, open_field, walker, yard
+from staged import (
+    OS1_32,
+    OS1_64,
+    OS1_128,
+    THRESHOLDS,
+    Thing,
+    Visit,
+    compare,
+    drive,
+    driver,
+    open_field,
+    submap,
+    walker,
+    yard,
+)
 
+from revisitd.daemon.detection.detector import detect, side_of
 from revisitd.drivers.virtual import shapes
 from revisitd.drivers.virtual.mesh import Material, box, merge, quads, tube
 from revisitd.drivers.virtual.vehicles import car
@@ -48,6 +65,16 @@ def test_people_who_walk_slowly_are_no_change():
 def test_people_who_stand_for_a_second_are_no_change():
     people = walker([(-4, 3), (8, 3.5)], 0, stop_s=2.0, stand_s=1.0), walker([(5, -3), (-8, -4)], 1, 1.0, 1, 2.5, 1.0)
     compare(yard().plus(movers=people)).expect()
+
+
+def test_two_people_whom_the_scans_chosen_met_at_one_place_are_no_change():
+    """They stand there one after the other; that the place was empty in between only the scans not chosen saw."""
+    stands = [walker([(-1.8, 4), (6, 4)], 1, 1.2, 3, 1.5, 1.2), walker([(4.68, 4), (-6, 4)], 1, 1.2, 4, 3.9, 1.3)]
+    before, after = drive(yard(), 0), drive(yard().plus(movers=tuple(stands)), 1)
+    chosen = submap(replace(after, scans=[after.scans[k] for k in (2, 3, 5, 6)]))
+    rest = submap(replace(after, scans=[after.scans[k] for k in (0, 1, 4, 7)]))
+    sides = side_of(submap(before), THRESHOLDS), side_of(chosen, THRESHOLDS, rest.around)
+    assert detect(*sides, THRESHOLDS).objects == []
 
 
 @pytest.mark.xfail(

@@ -13,20 +13,21 @@ from ..stopwatch import Stopwatch
 from .arrays import bounds, inside
 from .candidates import changed, dense_enough
 from .clusters import cluster, thin
+from .evidence import COMPLETE_M, Evidence
 from .ground import Ground, is_ground_like, segment_ground
-from .occlusion import latest_sight, persistent, scans_looking_through
+from .occlusion import scans_looking_through
 from .results import DetectedObject, Detection, Thresholds
 from .submap import NO_SCANS, Submap, join
 
 GROW_M = 0.5  # an object is completed by candidates this near to its confirmed points that nothing speaks against
-COMPLETE_M = 1.5  # ... and by looked-through points of any distance, so far around them,
-COMPLETE_STEP_M = 0.2  # without a gap wider than this
+COMPLETE_STEP_M = 0.2  # ... and by looked-through points of any distance, without a gap wider than this
 COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
 COUNTERPART_SHARE = 0.1  # also against the size of what came
 INSIDE_SHARE = 0.7  # of an object's points within another's outline, seen from above: it is a part of that
 LOW_M, LOW_SHARE = 0.4, 0.9  # above the ground, and of its points: an object that is low
 FAR_M = 2.0  # a distance to the other submap beyond this is not measured
 MIN_CONFIRMED_SHARE = 0.25  # of an object's points; a branch of which one leaf was looked past is no change
+STAYED_SHARE = 0.5  # of an object's confirmed points, which must have stayed by all scans near it
 
 
 Around = Callable[[np.ndarray, np.ndarray], Submap]  # lower and upper corner (3,) of a box, map frame -> what is in it
@@ -74,7 +75,7 @@ def _one_way(polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thre
     this = side.standing.only(is_far)
     this = this.only(dense_enough(this.points, t.rho_m, t.n))
     watch.lap("noise")
-    evidence = _Evidence(this, other.standing, t)
+    evidence = Evidence(this, other.standing, t)
     confirmed = evidence.confirmed()
     possible = evidence.possible(confirmed)
     in_vain = this.points[possible & evidence.in_vain()]
@@ -88,6 +89,8 @@ def _one_way(polarity: str, side: Side, is_far: np.ndarray, other: Side, t: Thre
         if len(np.unique(this.scan[member])) < t.min_showing_scans:
             continue
         if is_ground_like(this.points[kept], other.ground, t.ground_filter_c1_m, t.ground_filter_c2):
+            continue
+        if evidence.stayed(sure, join(this, side.more(*bounds(this.points[sure])))).mean() < STAYED_SHARE:
             continue
         more = _completion(this.points[sure], in_vain, side, other, t)
         found = _described(polarity, this, member, sure, more, other.standing, t)
@@ -140,42 +143,6 @@ def _both(whole: DetectedObject, part: DetectedObject) -> DetectedObject:
         n_seen_by=max(whole.n_seen_by, part.n_seen_by),
         n_confirming=max(whole.n_confirming, part.n_confirming),
     )
-
-
-class _Evidence:
-    """What is known of the points of a submap by the scans of the other side and of their own."""
-
-    def __init__(self, this: Submap, other: Submap, t: Thresholds, glimpses: bool = False):
-        """glimpses: for points beside what is sure already, half the margin behind them and glimpses are enough."""
-        self._this, self._t, self._glimpses = this, t, glimpses
-        self._limits = (0.5 if glimpses else 1.0) * t.occlusion_margin_m, t.occlusion_range_m
-        self._arrivals = this.visit.min() > other.visit.max()  # what left in an older visit was only passing by
-        self._seen = latest_sight(this.points, other, *self._limits, t.min_confirming_scans)
-
-    def confirmed(self) -> np.ndarray:
-        """Which points stayed through their own visit, and were looked through by the other: (N,) bool."""
-        return self._stayed(self._looked_through())
-
-    def possible(self, confirmed: np.ndarray) -> np.ndarray:
-        """Which points may belong to an object as well, (N,) bool: around confirmed ones, and nothing against them."""
-        possible = (self._seen.at <= self._seen.through) & ~self._looked_through()
-        points = self._this.points
-        possible[possible] = ~changed(points[possible], points[confirmed], COMPLETE_M, 1)
-        return self._stayed(possible) | confirmed
-
-    def in_vain(self) -> np.ndarray:
-        """To which points the other visit looked, (N,) bool: no return from there, nor from anything before it."""
-        seen = self._seen
-        return (seen.at == 0) & (seen.through + seen.open >= self._t.min_confirming_scans)
-
-    def _looked_through(self) -> np.ndarray:
-        return (self._seen.through >= self._t.min_confirming_scans) & (self._seen.through > self._seen.at)
-
-    def _stayed(self, asked: np.ndarray) -> np.ndarray:
-        this, t = self._this, self._t
-        stay = t.min_showing_scans, t.min_showing_s, self._glimpses, self._arrivals
-        asked[asked] = persistent(this.points[asked], this.scan[asked], this, *self._limits, *stay)
-        return asked
 
 
 def _completion(sure: np.ndarray, in_vain: np.ndarray, side: Side, other: Side, t: Thresholds) -> np.ndarray:
@@ -236,7 +203,7 @@ def _looked_through_around(points: np.ndarray, side: Side, other: Side, t: Thres
     near = near.only(_first_of_voxels(near.points))
     for ground in (side.ground, other.ground):
         near = near.only(~ground.is_under(near.points, t.ground_sigmas, t.ground_min_sigma_m))
-    return near.only(_Evidence(near, other.standing, t, glimpses).confirmed())
+    return near.only(Evidence(near, other.standing, t, glimpses).confirmed())
 
 
 def _described(

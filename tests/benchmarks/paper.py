@@ -98,7 +98,7 @@ def no_ground(points, *_):
     return np.zeros(len(points), bool), ground._ground(*nothing)
 
 
-class EverythingConfirmed(detector._Evidence):
+class EverythingConfirmed(detector.Evidence):
     """The evidence of a detector that does not ask what the other visit saw."""
 
     def confirmed(self):
@@ -107,9 +107,12 @@ class EverythingConfirmed(detector._Evidence):
     def possible(self, confirmed):
         return confirmed
 
+    def stayed(self, asked, _):
+        return np.ones(len(asked), bool)
+
 
 NO_OCCLUSION = {
-    "_Evidence": EverythingConfirmed,
+    "Evidence": EverythingConfirmed,
     "scans_looking_through": lambda points, images, *_: np.arange(len(images)),
     "_completion": lambda sure, *_: sure[:0],
     "_counterparts": lambda *_: [],
