@@ -23,7 +23,7 @@ def clock(mode: str, port_state: str = "LISTENING", pulse: int = 0, nmea: int = 
     }
 
 
-def test_temperature_voltage_and_active_alerts_are_read():
+def test_temperature_and_active_alerts_are_read():
     alert = {"active": True, "id": "0x01000015", "level": "WARNING", "msg": "Input voltage is low"}
     with fake_sensor() as fake:
         fake.others[TELEMETRY] = {"input_voltage_mv": 23606, "internal_temperature_deg_c": 42}
