@@ -12,9 +12,11 @@ from .features import N_RINGS, SECTOR_COLUMNS, features
 from .preprocess import LOG_RANGE_GAIN, N_COLUMNS, N_ROWS
 from .scan_sets import CachedWorld
 
-WORLDS_PER_BATCH = 3
+WORLDS_PER_BATCH = 2
+TWINS = 0.2  # of the scans of a draw are there twice, mostly through two sensors that face differently
 ONE_SENSOR = 0.5  # of the draws from a world are of scans through one sensor, the others of mixed ones
 SPOILT = 0.5  # of the training scans
+WINDOWED = 0.1  # of the spoilt ones: the sensor sends an azimuth window only
 NOISE = 0.03 * LOG_RANGE_GAIN  # up to 3 % of the range
 MAX_RING_SHIFT = 2.0  # rings of 17 %: places a third smaller or larger than the virtual ones
 
@@ -59,7 +61,9 @@ def draw_batch(worlds: list[FeaturesOfWorld], rng: np.random.Generator, n: int) 
     drawn, overlaps = [], []
     for chosen in rng.choice(len(worlds), WORLDS_PER_BATCH, replace=False):
         world = worlds[chosen]
-        index = rng.choice(len(world.overlap), part, replace=len(world.overlap) < part)
+        n_twins = int(TWINS * part)
+        index = rng.choice(len(world.overlap), part - n_twins, replace=len(world.overlap) < part)
+        index = np.concatenate((index, index[:n_twins]))
         variant = rng.integers(world.n_variants, size=1 if rng.random() < ONE_SENSOR else part)
         drawn.append(reshape_world(world.take(variant, index), rng))
         overlaps.append(torch.from_numpy(world.overlap[np.ix_(index, index)]))
@@ -82,7 +86,7 @@ def reshape_world(scans: Features, rng: np.random.Generator) -> Features:
 
 
 def spoil(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Range noise, lost returns, silent beams, lost packets and what stands too near, on (n, 3, 32, 256), in place."""
+    """Range noise, what is lost or not looked at, and what stands too near, on (n, 3, 32, 256), in place."""
     n = len(images)
     noise = rng.normal(0, 1, images[:, 0].shape) * rng.uniform(0, NOISE, (n, 1, 1))
     images[:, 0] += noise.astype(np.float32) * (images[:, 1] > 0)
@@ -98,6 +102,8 @@ def spoil(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         _stand_before(images[scan], rng)
     for scan in np.flatnonzero(rng.random(n) < 0.5):
         images[scan][:, :, _lost_columns(rng)] = 0
+    for scan in np.flatnonzero(rng.random(n) < WINDOWED):
+        images[scan][:, :, _outside_window(rng)] = 0
     return images
 
 
@@ -116,6 +122,11 @@ def _lost_columns(rng: np.random.Generator) -> np.ndarray:
     width = int(rng.choice((4, 8)))
     starts = rng.integers(N_COLUMNS, size=rng.integers(1, 1 + 48 // width))
     return (starts[:, None] + np.arange(width)).ravel() % N_COLUMNS
+
+
+def _outside_window(rng: np.random.Generator) -> np.ndarray:
+    """Columns of all but a window of half to nearly all azimuths."""
+    return (rng.integers(N_COLUMNS) + np.arange(rng.integers(N_COLUMNS // 16, N_COLUMNS // 2))) % N_COLUMNS
 
 
 def _one_set(images: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:

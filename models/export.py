@@ -25,7 +25,7 @@ EXPORT_TOLERANCE = 1e-5
 LIMITS = [
     "trained on virtual outdoor scans only, of one generator of worlds",
     "OS1 fields of view, 32 to 128 beams, full rotations; tilts beyond about 5 degrees were never seen",
-    "an azimuth window counts as columns lost: such scans were never trained on",
+    "an azimuth window counts as columns lost: its scans were trained on, against whole ones, but never measured",
     "sensor heights of 0.4 to 2.5 m above the ground",
     "overlap is that of a 64-beam reference sensor",
 ]

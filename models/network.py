@@ -27,7 +27,6 @@ RING_CHANNELS = 48
 RING_DILATIONS = (1, 2, 4)
 SPECTRUM_DILATIONS = (1, 2)
 N_WAVES, WAVE_CHANNELS = 8, 16
-HIDDEN = 512
 DROPOUT = 0.1
 OCCUPIED_GAIN = 3.0  # a third of a sector's rows in one cell fills it to two thirds
 AREA_REACH_M = 45.0
@@ -45,15 +44,8 @@ class DescriptorNetwork(nn.Module):
         self.grid = GridNetwork()
         self.spectrum = RingNetwork(FEATURE_SHAPES["spectrum"][0], N_SECTORS // 2, SPECTRUM_DILATIONS)
         n = self.shares.n_outputs + self.grid.n_outputs + self.spectrum.n_outputs + FEATURE_SHAPES["spectrum"][0]
-        self.head = nn.Sequential(
-            nn.BatchNorm1d(n),
-            nn.Dropout(DROPOUT),
-            nn.Linear(n, HIDDEN),
-            nn.BatchNorm1d(HIDDEN),
-            nn.ReLU(),
-            nn.Dropout(DROPOUT),
-            nn.Linear(HIDDEN, DESCRIPTOR_LENGTH),
-        )
+        # Linear: a hidden layer here learned the training worlds by heart (0.57 instead of 0.63 on new ones).
+        self.head = nn.Sequential(nn.BatchNorm1d(n), nn.Dropout(DROPOUT), nn.Linear(n, DESCRIPTOR_LENGTH))
 
     def forward(self, grid: torch.Tensor, rows: torch.Tensor, spectrum: torch.Tensor) -> torch.Tensor:
         filled = 1.0 - torch.exp(-OCCUPIED_GAIN * grid)

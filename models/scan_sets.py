@@ -83,6 +83,10 @@ class WorldScans:
             altitude_rad=self.altitude_rad[rows],
         )
 
+    def turned(self, columns: int) -> WorldScans:
+        """The same scans by a sensor that faces elsewhere, by some of its columns; T_world_sensor is as it was."""
+        return replace(self, range_mm=np.roll(self.range_mm, columns, axis=2))
+
     def inputs(self) -> np.ndarray:
         """(N, *INPUT_SHAPE) float32: the network's inputs."""
         resample = Resampler(self.pixel_shift, self.altitude_rad, self.range_mm.shape[2])
@@ -182,15 +186,20 @@ def _make(seed: int, path: Path) -> None:
 
 
 def _through_sensors(scans: WorldScans, overlap: np.ndarray, seed: int) -> CachedWorld:
-    """One world's scans as inputs through three sensors: its own, an OS1-32, one with a narrow view."""
+    """One world's scans as inputs through three sensors: its own, an OS1-32, one with a narrow view.
+
+    They face differently: a turn by part of an input column changes the inputs, and must not change the descriptor.
+    """
+    rng = np.random.default_rng((seed, 9))
     _, beams, columns = scans.range_mm.shape
-    narrow_step = int(np.random.default_rng((seed, 9)).choice((1, 2)))
+    narrow_step = int(rng.choice((1, 2)))
     sensors = (
         scans,
         scans.seen_by(beams // 32, columns // 512),
         scans.seen_by(narrow_step, 1, np.deg2rad(FIRST_OS1_FOV_DEG)),
     )
-    inputs = np.stack([sensor.inputs() for sensor in sensors]).astype(np.float16)
+    turned = (sensor.turned(int(rng.integers(sensor.range_mm.shape[2]))) for sensor in sensors)
+    inputs = np.stack([sensor.inputs() for sensor in turned]).astype(np.float16)
     return CachedWorld(seed, inputs, overlap)
 
 

@@ -25,13 +25,13 @@ from .metrics import descriptor_distances, pairs, rank_agreement
 from .network import DescriptorNetwork
 from .scan_sets import FIRST_SEED, cached_world
 
-BATCH = 96
-PEAK_RATE = 2e-3
+BATCH = 128
+PEAK_RATE = 3e-3
 WEIGHT_DECAY = 5e-2
 ERROR_SCALE = 0.1  # of the overlap: smaller errors count by their square, larger ones linearly
 APART_WEIGHT = 0.15
 RANK_WEIGHT = 0.2
-CHECKPOINT_STEPS = 200
+CHECKPOINT_STEPS = 500
 THREADS = 1
 PROCESSES = 2  # that prepare worlds
 
@@ -163,14 +163,14 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of scans, checkpoint, curve and model")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--worlds", type=int, default=60, help="training worlds; a fifth more for validation")
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--worlds", type=int, default=170, help="training worlds; a sixth more for validation")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     torch.set_num_threads(THREADS)
     arguments.out.mkdir(parents=True, exist_ok=True)
     training = prepare(arguments.out / "scans", "train", arguments.worlds)
-    validation = prepare(arguments.out / "scans", "validation", max(arguments.worlds // 5, 2))
+    validation = prepare(arguments.out / "scans", "validation", max(arguments.worlds // 6, 2))
     trainer = Trainer(arguments.out, arguments.seed, arguments.steps)
     trainer.resume()
     trainer.train(training, validation)
