@@ -44,7 +44,10 @@ def install(address: str, root: Path, start: bool) -> list[str]:
         done.append(f"wrote {settings}")
     if root == Path("/"):
         _run("systemd-sysusers", str(SYSUSERS.name))
-        _run("sysctl", "--quiet", "--load", f"/{SYSCTL}")
+        try:
+            _run("sysctl", "--quiet", "--load", f"/{SYSCTL}")
+        except InstallError as error:  # in a container the kernel is not ours: the service runs all the same
+            done.append(f"{error}; packets may be lost until /{SYSCTL} is in force on the machine itself")
         _run("systemctl", "daemon-reload")
         if start:
             _run("systemctl", "enable", "--quiet", "--now", UNIT.name)

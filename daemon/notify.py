@@ -60,7 +60,9 @@ def log_handler() -> logging.Handler:
         return handler
     if _journal is not None:
         # Fields in capitals come from `extra` of the log calls: SESSION=3, SCENE=17.
-        return _journal.JournalHandler(SYSLOG_IDENTIFIER=IDENTIFIER)
+        handler = _journal.JournalHandler(SYSLOG_IDENTIFIER=IDENTIFIER)
+        handler.setFormatter(logging.Formatter("%(message)s"))  # else basicConfig puts level and name before it
+        return handler
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_PriorityFormatter())
     return handler

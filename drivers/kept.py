@@ -124,9 +124,10 @@ class KeptSource:
                     inquiry = self._inquiry(live)
                 if not live.has_ids:
                     recheck.problem()  # of a restart, which its packets do not tell; whether it answers is no matter
-                self._tell(Phase.RUNNING, faults.problem())
+                self._tell(Phase.RUNNING, faults.problem() or live.strangers.problem())
             elif time.monotonic() - heard_s > self._silence_s:
-                self._tell(Phase.SILENT, faults.problem() or inquiry.problem())
+                why = [inquiry.problem(), live.strangers.problem()]  # a relay may send with an address of its own
+                self._tell(Phase.SILENT, faults.problem() or "; ".join(filter(None, why)))
             yield frame
             if frame is not None:
                 heard_s = time.monotonic()  # only now: a reader may take long for a frame

@@ -20,6 +20,7 @@ from .packets import FrameAssembler, PacketFilter, packets_per_frame
 from .sensor_http import SensorHttp, resolve
 from .sensor_setup import AS_IT_IS, SensorWish, prepare_sensor
 from .source import Source
+from .strangers import StrangerWatch
 
 BUFFER_S = 3.0  # odometry holds the GIL for up to 0.25 s; without a buffer 40 % of the columns are lost then
 BACKLOG_S = 1.0  # of packets that wait; beyond, whole frames are skipped: odometry does well with every second one
@@ -77,6 +78,7 @@ class LiveSource(Source):
             raise SensorUnavailable(
                 f"cannot listen at UDP port {self.port} for {address} ({error}): is another program listening there?"
             ) from None
+        self.strangers = StrangerWatch(self._packets.sockets()[0], sensor_ip, self.port)
         self._overflown = self._useless = 0
         self._frame_id = -1  # of the last packet
         self._skipping, self._n_skipped = False, 0  # that frame, and so many in a row
@@ -116,6 +118,7 @@ class LiveSource(Source):
         return self._packets.buffer_size() / self._packets_per_s
 
     def close(self) -> None:
+        self.strangers.close()
         self._packets.close()
 
     def _is_skipped(self, frame_id: int) -> bool:

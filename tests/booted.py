@@ -140,6 +140,6 @@ def _new_cgroup() -> Path:
     unified = Path("/sys/fs/cgroup")
     if not (unified / "cgroup.controllers").exists():
         unified /= "unified"  # a machine with both hierarchies
-    cgroup = unified / f"revisitd-test-{os.getpid()}"
+    cgroup = unified / f"revisitd-test-{os.getpid()}-{time.monotonic_ns()}"
     cgroup.mkdir()
     return cgroup

@@ -25,13 +25,10 @@ if __name__ == "__main__":
     main()
 END
 chmod 755 /opt/revisitd/bin/revisitd
-sed '/^revisitd:/d' /etc/passwd > /opt/passwd
-sed '/^revisitd:/d' /etc/group > /opt/group
-echo 'revisitd:x:61234:61234::/var/lib/revisitd:/usr/sbin/nologin' >> /opt/passwd
-echo 'revisitd:x:61234:' >> /opt/group
-chmod 644 /opt/passwd /opt/group
-mount --bind /opt/passwd /etc/passwd
-mount --bind /opt/group /etc/group
+# The user is that which the test makes, or the program.
+cp -a /etc /opt/etc
+sed -i '/^revisitd:/d' /opt/etc/passwd /opt/etc/shadow /opt/etc/group /opt/etc/gshadow
+mount --bind /opt/etc /etc
 for dir in /run /var/lib /var/log /var/cache /var/tmp /srv /dev/shm /tmp; do mount -t tmpfs -o mode=755 tmpfs $dir; done
 chmod 1777 /tmp /var/tmp /dev/shm
 umount -R /sys/fs/cgroup 2>/dev/null || umount -l /sys/fs/cgroup
@@ -39,5 +36,8 @@ mount -t cgroup2 cgroup2 /sys/fs/cgroup
 mkdir -p /run/systemd /run/lock /run/log
 mount --bind /proc/sys /proc/sys
 mount -o remount,bind,ro /proc/sys
-export container=unshare SYSTEMD_UNIT_PATH=/opt/units
+# Of the kernel's settings there is one that a test may write: a file that is none.
+cp /proc/sys/net/core/rmem_max /opt/rmem_max
+mount --bind /opt/rmem_max /proc/sys/net/core/rmem_max
+export container=unshare SYSTEMD_UNIT_PATH=/opt/units:/etc/systemd/system
 exec /lib/systemd/systemd --system --unit=test.target --show-status=no

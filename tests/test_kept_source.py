@@ -1,14 +1,16 @@
 """A sensor is kept open through all that it and the network do, and what is wrong is stated."""
 
 import socket
+import threading
 import time
+from contextlib import contextmanager
 
 import pytest
 from captures import metadata, packets, ranges_mm
 from fake_sensor import fake_sensor, free_port
 from follower import Follower
 
-from revisitd.drivers import kept, sensor_setup
+from revisitd.drivers import kept, sensor_setup, strangers
 from revisitd.drivers.kept import KeptSource, Phase
 from revisitd.drivers.sensor_setup import SensorWish
 
@@ -170,3 +172,57 @@ def test_a_flood_of_bad_packets_is_one_line_in_the_log(follow, caplog, capfd):
         follower.until_opened(2)
     assert len(caplog.records) == 1
     assert capfd.readouterr().err == ""
+
+
+@contextmanager
+def stranger(payload, port):
+    """Another sender, at 127.0.0.2, whose packets come all the time."""
+    stop = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.2", 0))
+
+        def send():
+            while not stop.wait(0.002):
+                sender.sendto(payload, ("127.0.0.1", port))
+
+        sending = threading.Thread(target=send)
+        sending.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            sending.join()
+
+
+@pytest.mark.parametrize("is_replay", [True, False], ids=["replay", "garbage"])
+def test_packets_from_another_address_are_named_once_and_harm_no_frame(follow, caplog, is_replay):
+    with fake_sensor() as fake:
+        port = fake.document["config_params"]["udp_port_lidar"]
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        payload = packets(fake.document, range(7, 8))[0] if is_replay else bytes(1000)
+        with stranger(payload, port):
+            while not follower.source.state.problem:
+                sent = len(follower.frames)
+                fake.send(packets(fake.document, range(sent, sent + 1)))
+                follower.more_frames(1)
+        state = follower.source.state
+        assert state.problem == (
+            f"packets of 127.0.0.2 ({len(payload)} bytes) come to UDP port {port}; they are left out, as the sensor is "
+            "127.0.0.1: let that sender use another port"
+        )
+    assert state.phase is Phase.RUNNING and state.n_opened == 1
+    assert [record.levelname for record in caplog.records].count("WARNING") == 1
+    for index, frame in enumerate(follower.frames):
+        assert (frame.range_mm == ranges_mm(index)).all()
+
+
+def test_who_sends_in_place_of_a_silent_sensor_is_named_until_it_ceases(follow, monkeypatch):
+    monkeypatch.setattr(strangers, "QUIET_S", 0.3)
+    with fake_sensor() as fake:
+        follower = follow(fake.address)
+        follower.until_opened(1)
+        with stranger(bytes(1000), fake.document["config_params"]["udp_port_lidar"]):
+            state = follower.until_problem("packets of 127.0.0.2")
+            assert "sends nothing to UDP port" in state.problem and state.phase is Phase.SILENT
+        follower.until(lambda state: "127.0.0.2" not in state.problem)
