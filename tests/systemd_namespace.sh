@@ -25,9 +25,10 @@ if __name__ == "__main__":
     main()
 END
 chmod 755 /opt/revisitd/bin/revisitd
-# The user is that which the test makes, or the program.
+# Without the service and the user that this machine may have itself.
 cp -a /etc /opt/etc
-sed -i '/^revisitd:/d' /opt/etc/passwd /opt/etc/shadow /opt/etc/group /opt/etc/gshadow
+rm -rf /opt/etc/revisitd /opt/etc/systemd/system/revisitd*
+sed -i '/^revisitd:/d' /opt/etc/passwd /opt/etc/group /opt/etc/*shadow
 mount --bind /opt/etc /etc
 for dir in /run /var/lib /var/log /var/cache /var/tmp /srv /dev/shm /tmp; do mount -t tmpfs -o mode=755 tmpfs $dir; done
 chmod 1777 /tmp /var/tmp /dev/shm
