@@ -1,5 +1,9 @@
 """The commands' manners: help, exit codes, one clear line for each error."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 from click.testing import CliRunner
 
@@ -8,6 +12,14 @@ from revisitd.daemon.cli import cli
 
 def invoke(*arguments):
     return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def test_small_matrix_products_do_not_keep_a_second_core_busy():
+    """Each library's own threads are started when it is loaded."""
+    count = "import os, revisitd.daemon.cli, numpy, scipy.linalg; print(len(os.listdir('/proc/self/task')))"
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    found = subprocess.run([sys.executable, "-c", count], env=environment, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "1"
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
