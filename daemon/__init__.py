@@ -2,6 +2,6 @@
 
 import os
 
-# Before numpy is loaded: its matrix products are small here, and OpenBLAS's second thread spins between them. It took
-# 30 s of CPU where one thread takes 9 (90 key scans, relocate.py's steps, both cores busy), and halved the frame rate.
+# Before numpy is loaded: its matrix products are small here, and OpenBLAS's second thread waits busily between them. On a
+# machine whose cores are busy that costs more than all the work (OPENBLAS_NUM_THREADS=2 relocate.py shows it).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

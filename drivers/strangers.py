@@ -38,6 +38,7 @@ class StrangerWatch:
         return self._problem
 
     def close(self) -> None:
+        """Ends the watch and lets go of the socket."""
         self._closing.set()
         self._thread.join()
         self._socket.close()
