@@ -5,7 +5,21 @@ import pytest
 
 pytest.importorskip("revisitd.drivers.virtual.embree", reason="needs the extra [sim]", exc_type=ImportError)
 
-from staged import OS1_64, OS1_128, Outcome, Thing, Visit, compare, detected, drive, house, open_field, submap, yard
+from staged import (
+    OS1_64,
+    OS1_128,
+    Outcome,
+    Thing,
+    Visit,
+    compare,
+    detected,
+    drive,
+    error,
+    house,
+    open_field,
+    submap,
+    yard,
+)
 
 from revisitd.daemon.detection.erasure import update_map
 from revisitd.daemon.detection.results import Erasure
@@ -143,6 +157,20 @@ def test_a_car_door_that_opens_is_found_with_the_place_it_left():
         Thing("open", made.door_open.moved(**place), (1,)),
     )
     compare(world).expect(appeared={"open": BESIDE_WHAT_STAYS}, disappeared={"shut": BESIDE_WHAT_STAYS})
+
+
+@pytest.mark.parametrize("z_m", [-0.1, 0.1])
+def test_a_van_door_that_opens_takes_no_roof_with_it_where_poses_are_wrong(z_m):
+    made = car(rng(4), "van")  # its roof at the sensor's height, seen at a grazing angle
+    place = dict(xyz=(0.5, -4.2, 0), yaw=0.0)
+    world = yard().plus(
+        Thing("body", made.body.moved(**place)),
+        Thing("shut", made.door_shut.moved(**place), (0,)),
+        Thing("open", made.door_open.moved(**place), (1,)),
+    )
+    outcome = compare(world, second=Visit(error=error(z_m=z_m)))
+    outcome.expect(appeared={"open": BESIDE_WHAT_STAYS}, disappeared={"shut": 0.5})
+    assert all(np.ptp(found.points, axis=0).max() < 1.2 for found in outcome.detection.objects)
 
 
 def test_a_house_door_that_opens_is_found_with_the_place_it_left():

@@ -23,6 +23,7 @@ GROW_M = 0.5  # an object is completed by candidates this near to its confirmed 
 COMPLETE_STEP_M = 0.2  # ... and by looked-through points of any distance, without a gap wider than this
 COUNTERPART_POINTS = 50  # what left beside a thing that came is no candidate by itself: ask for more of it,
 COUNTERPART_SHARE = 0.1  # also against the size of what came
+APART_M = 0.12  # of what the other visit met: nearer, a level surface is looked over by poses 10 cm too high
 INSIDE_SHARE = 0.7  # of an object's points within another's outline, seen from above: it is a part of that
 LOW_M, LOW_SHARE = 0.4, 0.9  # above the ground, and of its points: an object that is low
 FAR_M = 2.0  # a distance to the other submap beyond this is not measured
@@ -196,13 +197,17 @@ def _counterparts(
 
 
 def _looked_through_around(points: np.ndarray, side: Side, other: Side, t: Thresholds, glimpses: bool) -> Submap:
-    """What stands around some points, by all scans of a side, and was looked through by the other; one per voxel."""
+    """What stands around some points, by all scans of a side, and was looked through by the other; one per voxel.
+
+    What the other side met in the same place is left out: a roof at the sensor's height is both looked over and met.
+    """
     lower, upper = bounds(points)
     box = lower - np.float32(COMPLETE_M), upper + np.float32(COMPLETE_M)
     near = join(side.standing.around(*box), side.more(*box))
     near = near.only(_first_of_voxels(near.points))
     for ground in (side.ground, other.ground):
         near = near.only(~ground.is_under(near.points, t.ground_sigmas, t.ground_min_sigma_m))
+    near = near.only(changed(near.points, other.standing.points, APART_M, 1))
     return near.only(Evidence(near, other.standing, t, glimpses).confirmed())
 
 
